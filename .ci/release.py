@@ -52,8 +52,12 @@ def main() -> None:
     """Make the files of a release; the first fault ends it with exit code 1."""
     parser = argparse.ArgumentParser(description="Make the files of a release.")
     parser.add_argument("--dist", type=Path, default=ROOT / "dist", help="folder for the files")
-    parser.add_argument("--python", default=sys.executable, help="interpreter of the fresh environment")
-    parser.add_argument("--rehearse", action="store_true", help="build the checkout as it is, without a tag")
+    parser.add_argument(
+        "--python", default=sys.executable, help="interpreter of the fresh environment"
+    )
+    parser.add_argument(
+        "--rehearse", action="store_true", help="build the checkout as it is, without a tag"
+    )
     options = parser.parse_args()
     if not options.rehearse:
         end_with(faults_of_commit(ROOT, version_of(ROOT)))
@@ -61,9 +65,21 @@ def main() -> None:
     end_with([*faults_of_wheel(wheel), *faults_of_source(source), *faults_of_versions(wheel, ROOT)])
     with tempfile.TemporaryDirectory(prefix=f"{PACKAGE}-release-") as folder:
         python = fresh_environment(options.python, Path(folder))
-        for file, words in ((wheel, ["--only-binary", ":all:"]), (source, ["--no-deps", "--force-reinstall"])):
+        for file, words in (
+            (wheel, ["--only-binary", ":all:"]),
+            (source, ["--no-deps", "--force-reinstall"]),
+        ):
             began = time.monotonic()
-            quiet(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *words, str(file))
+            quiet(
+                python,
+                "-m",
+                "pip",
+                "install",
+                "--quiet",
+                "--disable-pip-version-check",
+                *words,
+                str(file),
+            )
             print(f"{file.name}: installed in {time.monotonic() - began:.0f} s, {describe(python)}")  # noqa: T201
             rehearse(python, Path(folder) / f"run of {file.name}")
         bill = list_packages(python, Path(folder) / "tools", wheel.with_suffix(".cdx.json"))
@@ -80,7 +96,9 @@ def end_with(faults: list[str]) -> None:
 
 def version_of(root: Path) -> str:
     """Return the version that the project of a folder has."""
-    return str(tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"])
+    return str(
+        tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    )
 
 
 def faults_of_commit(root: Path, version: str) -> list[str]:
@@ -91,7 +109,9 @@ def faults_of_commit(root: Path, version: str) -> list[str]:
     if not tagged:
         faults.append(f"no commit has the tag {tag}; git tag -a {tag}, or --rehearse")
     elif tagged != head:
-        faults.append(f"the checkout is at {head[:12]}, {tag} is {tagged[:12]}; git checkout {tag}, or --rehearse")
+        faults.append(
+            f"the checkout is at {head[:12]}, {tag} is {tagged[:12]}; git checkout {tag}, or --rehearse"
+        )
     if git(root, "status", "--porcelain"):
         faults.append("the checkout has changes; commit or remove them, or --rehearse")
     if f"\n## {version} (" not in (root / "CHANGELOG.md").read_text(encoding="utf-8"):
@@ -101,7 +121,9 @@ def faults_of_commit(root: Path, version: str) -> list[str]:
 
 def git(root: Path, *words: str) -> str:
     """Return the output of a git command in a folder; empty if it fails."""
-    return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False).stdout.strip()
+    return subprocess.run(
+        ["git", *words], cwd=root, capture_output=True, text=True, check=False
+    ).stdout.strip()
 
 
 def build(dist: Path) -> tuple[Path, Path]:
@@ -117,13 +139,23 @@ def faults_of_wheel(path: Path) -> list[str]:
     """Return the faults of a wheel: names of files, metadata."""
     with zipfile.ZipFile(path) as wheel:
         names = set(wheel.namelist())
-    faults = [f"{path.name} lacks {PACKAGE}/{name}" for name in NEEDED if f"{PACKAGE}/{name}" not in names]
-    faults += [f"{path.name} holds {name}" for name in sorted(names) if any(word in f"/{name}" for word in UNWANTED)]
+    faults = [
+        f"{path.name} lacks {PACKAGE}/{name}" for name in NEEDED if f"{PACKAGE}/{name}" not in names
+    ]
+    faults += [
+        f"{path.name} holds {name}"
+        for name in sorted(names)
+        if any(word in f"/{name}" for word in UNWANTED)
+    ]
     top = {name.partition("/")[0] for name in names if ".dist-info/" not in name}
     if top != {PACKAGE}:
         faults.append(f"{path.name} installs {', '.join(sorted(top))}, wanted {PACKAGE} alone")
     told = metadata(path)
-    faults += [f"{path.name} has no {key}" for key in ("Requires-Python", "License-Expression") if not told[key]]
+    faults += [
+        f"{path.name} has no {key}"
+        for key in ("Requires-Python", "License-Expression")
+        if not told[key]
+    ]
     if told["Description-Content-Type"] != "text/markdown":
         faults.append(f"{path.name} does not say that its description is Markdown")
     return faults
@@ -147,7 +179,11 @@ def faults_of_versions(wheel: Path, root: Path) -> list[str]:
             if line.startswith("version:")
         ),
     }
-    return [f"{file} says version {found}, the wheel {version}" for file, found in told.items() if found != version]
+    return [
+        f"{file} says version {found}, the wheel {version}"
+        for file, found in told.items()
+        if found != version
+    ]
 
 
 def metadata(wheel: Path) -> Message:
@@ -183,14 +219,22 @@ def list_packages(python: Path, folder: Path, path: Path) -> Path:
 def faults_of_licences(bill: Path) -> list[str]:
     """Return the packages of a CycloneDX file that state no licence, unless it was read in their files."""
     parts = json.loads(bill.read_text(encoding="utf-8"))["components"]
-    nameless = [each["name"] for each in parts if not each.get("licenses") and each["name"] not in LICENCES]
+    nameless = [
+        each["name"] for each in parts if not each.get("licenses") and each["name"] not in LICENCES
+    ]
     return [f"{name} states no licence; read its files and add it to LICENCES" for name in nameless]
 
 
 def describe(python: Path) -> str:
     """Return how much an environment holds."""
-    listed = quiet(python, "-m", "pip", "list", "--disable-pip-version-check", "--format", "freeze").splitlines()
-    size = sum(path.stat().st_size for path in python.parents[1].rglob("*") if path.is_file() and not path.is_symlink())
+    listed = quiet(
+        python, "-m", "pip", "list", "--disable-pip-version-check", "--format", "freeze"
+    ).splitlines()
+    size = sum(
+        path.stat().st_size
+        for path in python.parents[1].rglob("*")
+        if path.is_file() and not path.is_symlink()
+    )
     return f"{len(listed)} packages, {size / 1e6:.0f} MB"
 
 
@@ -207,10 +251,17 @@ def quiet(python: Path, *words: str, folder: Path = ROOT) -> str:
     """Run Python without the checkout on its path and return its output; a failure ends the rehearsal with it."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
-        [str(python), *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        [str(python), *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
-        sys.exit(f"release: {' '.join(words)}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+        sys.exit(
+            f"release: {' '.join(words)}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
+        )
     return done.stdout
 
 

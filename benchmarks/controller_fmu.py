@@ -52,7 +52,9 @@ def measured(name: str, folder: Path) -> tuple[list[float], float, int]:
         return [controller.step(*each) for each in zip(observations, references, strict=False)]
 
     pairs = zip(go(original), go(plugged), strict=True)
-    worst = max(float(np.abs(one.joint_velocity - other.joint_velocity).max()) for one, other in pairs)
+    worst = max(
+        float(np.abs(one.joint_velocity - other.joint_velocity).max()) for one, other in pairs
+    )
     times = [processor_time(partial(go, each), 1) / PERIODS for each in (original, plugged)]
     plant.close()
     return times, worst, model.recorded.states
@@ -66,9 +68,22 @@ def main() -> None:
         for name in methods:
             (python, fmu), worst, size = measured(name, Path(folder))
             differences.append(worst)
-            words = microseconds(python), microseconds(fmu), f"{python / fmu:.1f}", f"{worst:.1e}", size
+            words = (
+                microseconds(python),
+                microseconds(fmu),
+                f"{python / fmu:.1f}",
+                f"{worst:.1e}",
+                size,
+            )
             rows.append([f"`{name}`", *words])
-    header = ["controller", "original [µs]", "FMU [µs]", "original / FMU", "difference [rad/s]", "numbers remembered"]
+    header = [
+        "controller",
+        "original [µs]",
+        "FMU [µs]",
+        "original / FMU",
+        "difference [rad/s]",
+        "numbers remembered",
+    ]
     print(table(header, rows))
     if max(differences) > LIMIT:
         sys.exit("controller_fmu: missed")

@@ -63,17 +63,27 @@ def swings(drives: DriveConfig, robots: int) -> tuple[FloatArray, FloatArray]:
 def detections(poses: int) -> FloatArray:
     """Return how far detected balls are from the true ones on both engines, and from each other, (k, 3) m."""
     model, camera, rng = find_robot("ur5").nominal, CAMERA, np.random.default_rng(FIRST_SEED)
-    scenes = [kind(Room(model.arm, False, find_robot("ur5"))) for kind in (BulletScene, MujocoScene)]
+    scenes = [
+        kind(Room(model.arm, False, find_robot("ur5"))) for kind in (BulletScene, MujocoScene)
+    ]
     rows = []
     for _ in range(poses):
         theta = np.array(HOME) + rng.uniform(-0.6, 0.6, 6)
         for scene in scenes:
             scene.place(theta)
-        found = [find_ball(*scene.render(camera, model.X_BC), camera, BALL_RADIUS) for scene in scenes]
+        found = [
+            find_ball(*scene.render(camera, model.X_BC), camera, BALL_RADIUS) for scene in scenes
+        ]
         if found[0] is not None and found[1] is not None:
             one, other = found[0].centre, found[1].centre
             true = model.to_camera(scenes[0].ball_position())
-            rows.append([np.linalg.norm(one - true), np.linalg.norm(other - true), np.linalg.norm(one - other)])
+            rows.append(
+                [
+                    np.linalg.norm(one - true),
+                    np.linalg.norm(other - true),
+                    np.linalg.norm(one - other),
+                ]
+            )
     for scene in scenes:
         scene.close()
     return np.array(rows)
@@ -87,8 +97,21 @@ def main() -> None:
         one, other = swings(drives, robots)
         apart = 1e3 * np.abs(one - other)
         worst = apart.max(axis=(1, 2))
-        rows.append([name, *(f"{value:.3f}" for value in (np.sqrt(np.mean(apart**2)), np.median(worst), worst.max()))])
-    print(table([f"joints of {robots} robots", "RMS, mrad", "largest, median robot", "largest of all"], rows))
+        rows.append(
+            [
+                name,
+                *(
+                    f"{value:.3f}"
+                    for value in (np.sqrt(np.mean(apart**2)), np.median(worst), worst.max())
+                ),
+            ]
+        )
+    print(
+        table(
+            [f"joints of {robots} robots", "RMS, mrad", "largest, median robot", "largest of all"],
+            rows,
+        )
+    )
     print()
     found = 1e3 * detections(poses)
     names = ("`bullet` to the true centre", "`mujoco` to the true centre", "between them")

@@ -52,7 +52,12 @@ def bare_calls(plant: Bench) -> Callable[[int], None]:
     library, component = instance.library.loaded, instance._component
     set_real, inputs = library.fmi2SetReal, (*world._command.variables, world._command.pointer())
     get_real, outputs = library.fmi2GetReal, (*world._result.variables, world._result.pointer())
-    do_step, now, step, yes = library.fmi2DoStep, ctypes.c_double(), ctypes.c_double(PERIOD), ctypes.c_int(1)
+    do_step, now, step, yes = (
+        library.fmi2DoStep,
+        ctypes.c_double(),
+        ctypes.c_double(PERIOD),
+        ctypes.c_int(1),
+    )
 
     def call(k: int) -> None:
         set_real(component, *inputs)
@@ -115,7 +120,10 @@ def main() -> None:
             steps[name](k)
 
     times = times_in_turns({name: partial(many, name) for name in steps}, rounds, time.perf_counter)
-    best = {name: min(values) / (CALLS // runs[name] * runs[name]) * 1e6 for name, values in times.items()}
+    best = {
+        name: min(values) / (CALLS // runs[name] * runs[name]) * 1e6
+        for name, values in times.items()
+    }
     print(table(["step of the FMU of the UR5", "a step", "× bare calls"],
                 [[name, f"{value:.2f} µs", f"{value / best[BARE]:.2f}"] for name, value in best.items()]))  # fmt: skip
     for plant in plants:

@@ -32,7 +32,9 @@ def sweep(cluster: Any, robots: int, idle: float = 0.0) -> Cost:  # noqa: ANN401
     """Return what a sweep over all methods takes; the scheduler lives in this process, whose idle share is given."""
     names = "sweep", "--controllers", ",".join(METHODS), "--scheduler", cluster.scheduler_address
     used = time.process_time()
-    parent, wall = sweep_times([sys.executable, "-m", "servobench", *names, "--seeds", seeds(robots)])
+    parent, wall = sweep_times(
+        [sys.executable, "-m", "servobench", *names, "--seeds", seeds(robots)]
+    )
     return Cost(wall, parent, time.process_time() - used - idle * wall)
 
 
@@ -88,7 +90,9 @@ def main() -> None:
     for cores in CORES:
         seconds = start.wall + runs * max(one.wall / cores, serial)
         rows.append([cores, f"{seconds:.0f} s", f"{runs * PERIODS / seconds / 1e6:.2f}"])
-    print(f"Estimate for {runs:,} runs, {runs * PERIODS / 1e6:,.0f} million periods over the {len(METHODS)} methods:\n")
+    print(
+        f"Estimate for {runs:,} runs, {runs * PERIODS / 1e6:,.0f} million periods over the {len(METHODS)} methods:\n"
+    )
     print(table(["cores", "estimate", "million periods a second"], rows))
 
 

@@ -28,15 +28,22 @@ MISMATCHES = ("moderate", "moderate+gear_ratio=3%", "severe", "severe+gear_ratio
 
 def parameters(true: RobotModel, nominal: RobotModel) -> dict[str, float]:
     """Return the deviations of gears, zeros, lengths and tool by their names."""
-    names, values = nominal.arm.joint_names, dict(zip(TOOL, (true.arm.tool - nominal.arm.tool).tolist(), strict=True))
+    names, values = (
+        nominal.arm.joint_names,
+        dict(zip(TOOL, (true.arm.tool - nominal.arm.tool).tolist(), strict=True)),
+    )
     gears = true.arm.gear_ratio / nominal.arm.gear_ratio - 1.0
     zeros = true.arm.joint_offset - nominal.arm.joint_offset
     for kind, each in (("gear", gears), ("zero", zeros)):
-        values |= {f"{kind}_{name}": value for name, value in zip(names, each.tolist(), strict=True)}
+        values |= {
+            f"{kind}_{name}": value for name, value in zip(names, each.tolist(), strict=True)
+        }
     for name in parameter_names(nominal.arm):
         if name.startswith("link"):
             row, axis = int(name.split("_")[1]), "xyz".index(name[-1])
-            values[name] = true.arm.translation[row, axis] / nominal.arm.translation[row, axis] - 1.0
+            values[name] = (
+                true.arm.translation[row, axis] / nominal.arm.translation[row, axis] - 1.0
+            )
     return values
 
 
@@ -46,29 +53,58 @@ def draw_hidden(seed: int, plant: str) -> tuple[str, str, dict[str, Any]]:
     robot, mismatch = str(draws.choice(ARMS)), str(draws.choice(MISMATCHES))
     latency, delay, lag = (round(float(draws.uniform(0.0, most)), 3) for most in (0.13, 0.06, 0.1))
     shape = np.diag(draws.uniform(0.5, 2.0, 3))
-    sections: dict[str, Any] = {"sensing": {"latency": latency, "noise_shape": shape.tolist()}, "command_delay": delay}
+    sections: dict[str, Any] = {
+        "sensing": {"latency": latency, "noise_shape": shape.tolist()},
+        "command_delay": delay,
+    }
     if plant == "kinematic":
         return robot, mismatch, sections | {"lag": max(lag, 0.01)}
-    free = {"coulomb_friction": [0.0], "viscous_friction": [0.0], "payload": 0.0, "assumed_payload": 0.0}
-    return robot, mismatch, sections | {"scenery": False, "drives": free if draws.random() < 0.5 else {}}
+    free = {
+        "coulomb_friction": [0.0],
+        "viscous_friction": [0.0],
+        "payload": 0.0,
+        "assumed_payload": 0.0,
+    }
+    return (
+        robot,
+        mismatch,
+        sections | {"scenery": False, "drives": free if draws.random() < 0.5 else {}},
+    )
 
 
 def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
     """Identify one hidden plant, and return a row a parameter."""
     robot, mismatch, sections = draw_hidden(seed, plant)
     latency, delay = sections["sensing"]["latency"], sections["command_delay"]
-    task, reach = ("random", np.inf) if plant == "kinematic" else ("target", 0.15)  # engines have a table
-    settings = {plant: sections, task: {"duration": 60.0}, "Excite": {"swing": 0.25, "reach": reach}}
+    # Engines have a table
+    task, reach = ("random", np.inf) if plant == "kinematic" else ("target", 0.15)
+    settings = {
+        plant: sections,
+        task: {"duration": 60.0},
+        "Excite": {"swing": 0.25, "reach": reach},
+    }
     chosen: dict[str, Any] = {"robot": robot, "mismatch": mismatch, "seed": seed}
     made = servobench.run("docs/examples/excite.py", plant, task=task, settings=settings, **chosen)
-    about: dict[str, Any] = {"seed": seed, "robot": robot, "mismatch": mismatch, "rows": len(made.steps)}
+    about: dict[str, Any] = {
+        "seed": seed,
+        "robot": robot,
+        "mismatch": mismatch,
+        "rows": len(made.steps),
+    }
     if made.row["status"] != "completed":
         return [about | {"parameter": "", "said": f"the run ended: {made.row['reason']}"}]
     request = RunRequest(plant, "constant", task, read_mismatch(mismatch), seed, robot=robot)
     experiment = build(resolve(request, Settings(settings | {})))
-    log, nominal = read_log(experiment.plant.spec, made.steps), find_sensing("position").nominal(find_robot(robot))
+    log, nominal = (
+        read_log(experiment.plant.spec, made.steps),
+        find_sensing("position").nominal(find_robot(robot)),
+    )
     experiment.plant.close()
-    others = {name: find_robot(name).nominal for name in ROBOTS if name != robot and find_robot(name).n == log.spec.n}
+    others = {
+        name: find_robot(name).nominal
+        for name in ROBOTS
+        if name != robot and find_robot(name).n == log.spec.n
+    }
     began = time.perf_counter()
     said, found = mistakes(log, nominal, lambda: others)
     response = command_response(log)
@@ -82,9 +118,12 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
         rows += zip(("command_delay", "lag"), errors, sizes, told, strict=True)
     if found is not None:
         estimates = zip(found.names, found.values, found.deviations, found.told, strict=True)
-        rows += [(name, value - true[name], *other) for name, value, *other in estimates if name in true]
+        rows += [
+            (name, value - true[name], *other) for name, value, *other in estimates if name in true
+        ]
     return [
-        about | dict(zip(("parameter", "error", "deviation", "told"), row, strict=False)) for row in rows or [("",)]
+        about | dict(zip(("parameter", "error", "deviation", "told"), row, strict=False))
+        for row in rows or [("",)]
     ]
 
 
@@ -92,10 +131,16 @@ def main() -> None:
     """Print the tables."""
     given = options(__doc__, plant="kinematic", robots=200, first=81000)
     table = pd.DataFrame(
-        [row for seed in range(given.first, given.first + given.robots) for row in hidden(seed, given.plant)]
+        [
+            row
+            for seed in range(given.first, given.first + given.robots)
+            for row in hidden(seed, given.plant)
+        ]
     )
     runs = table.drop_duplicates("seed")
-    print(f"{len(runs)} logs, {(runs['said'] != '').sum()} with a line, median {runs['seconds'].median():.1f} s a log")
+    print(
+        f"{len(runs)} logs, {(runs['said'] != '').sum()} with a line, median {runs['seconds'].median():.1f} s a log"
+    )
     print(runs.loc[runs["said"] != "", ["seed", "robot", "mismatch", "said"]].to_string())
     late = table[table["parameter"] == "latency"]
     error = late["error"].abs()

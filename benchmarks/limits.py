@@ -17,7 +17,8 @@ from servobench.plant.robot.ur5 import HOME
 
 PERIOD, KEPT = 0.05, np.exp(-1.0)  # [s]; share of a joint's velocity that is left after a period
 RHO, LAMBDA = 0.287, 0.00163  # gains of the law
-WALK, NOISE, START, LEAST = 1.04e-4, 2e-6, 4.65e-5, 0.002  # variances of the filter, smallest motion [rad]
+# Variances of the filter, smallest motion [rad]
+WALK, NOISE, START, LEAST = (1.04e-4, 2e-6, 4.65e-5, 0.002)
 SOURCE = Path(__file__).with_name("bare_loop.c")
 
 
@@ -52,15 +53,21 @@ def _learn(
     gain = seen / (np.vecdot(dq, seen) + NOISE)[:, None]
     moved = (np.vecdot(dq, dq) >= LEAST**2)[:, None, None]
     learned = J + (dy - np.matvec(J, dq))[..., None] * gain[:, None, :]
-    return np.where(moved, learned, J), np.where(moved, wide - gain[..., None] * seen[:, None, :], P)
+    return np.where(moved, learned, J), np.where(
+        moved, wide - gain[..., None] * seen[:, None, :], P
+    )
 
 
 def bare_c(runs: int) -> float:
     """Return the same for the loop in C, with an arm of its own for each run."""
     with tempfile.TemporaryDirectory() as scratch:
         program = f"{scratch}/bare_loop"
-        subprocess.run(["cc", "-O3", "-march=native", "-o", program, str(SOURCE), "-lm"], check=True)
-        printed = subprocess.run([program, str(runs)], capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            ["cc", "-O3", "-march=native", "-o", program, str(SOURCE), "-lm"], check=True
+        )
+        printed = subprocess.run(
+            [program, str(runs)], capture_output=True, text=True, check=True
+        ).stdout
     return 1e-9 * float(printed.split()[0])
 
 
@@ -82,8 +89,12 @@ def main() -> None:
         f"numpy, {8 * runs} runs side by side": min(bare_numpy(8 * runs) for _ in range(rounds)),
         f"the package, a block of {runs}": min(block(runs) for _ in range(rounds + 1)),
     }
-    rows = [[name, f"{microseconds(cost)} µs", f"{cost / limit:.1f}"] for name, cost in costs.items()]
-    print(table(["bare arithmetic of `kinematic` with `ukf_mfac:published`", "a period", "× C"], rows))
+    rows = [
+        [name, f"{microseconds(cost)} µs", f"{cost / limit:.1f}"] for name, cost in costs.items()
+    ]
+    print(
+        table(["bare arithmetic of `kinematic` with `ukf_mfac:published`", "a period", "× C"], rows)
+    )
 
 
 if __name__ == "__main__":

@@ -17,7 +17,13 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-METHODS = "ukf_mfac", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published"
+METHODS = (
+    "ukf_mfac",
+    "ukf_mfac:published",
+    "ukf_mpc:published",
+    "rbf_pid:published",
+    "rbfnn_mfac:published",
+)
 PERIODS = 200  # of a run of the task random
 FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110
@@ -26,10 +32,16 @@ QUICK = {"action": "store_true", "help": "few runs only: test the page, not the 
 
 def options(description: str | None, **named: Any) -> argparse.Namespace:  # noqa: ANN401 - of any type
     """Return the options of a command, each given by its default, default and help text, or keywords of argparse."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name, given in named.items():
         default, text = given if isinstance(given, tuple) else (given, None)
-        keywords = given if isinstance(given, dict) else {"default": default, "type": type(default), "help": text}
+        keywords = (
+            given
+            if isinstance(given, dict)
+            else {"default": default, "type": type(default), "help": text}
+        )
         parser.add_argument(f"--{name}", **keywords)
     return parser.parse_args()
 
@@ -45,8 +57,14 @@ def resolved_runs(plant: str, method: str, count: int, duration: float | None = 
     from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import resolve
 
-    settings, mismatch = Settings({"random": {"duration": duration}} if duration else {}), cast(Any, "moderate")
-    return [resolve(RunRequest(plant, method, "random", mismatch, FIRST_SEED + i), settings) for i in range(count)]
+    settings, mismatch = (
+        Settings({"random": {"duration": duration}} if duration else {}),
+        cast(Any, "moderate"),
+    )
+    return [
+        resolve(RunRequest(plant, method, "random", mismatch, FIRST_SEED + i), settings)
+        for i in range(count)
+    ]
 
 
 def processor_time(call: Callable[[], object], calls: int, rounds: int = 3) -> float:
@@ -62,7 +80,9 @@ def processor_time(call: Callable[[], object], calls: int, rounds: int = 3) -> f
 
 
 def times_in_turns(
-    calls: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = time.process_time
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int,
+    clock: Callable[[], float] = time.process_time,
 ) -> dict[str, list[float]]:
     """Return the times of each call [s], a number a round: calls take turns, so that a disturbance meets all alike.
 

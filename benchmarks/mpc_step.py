@@ -23,7 +23,8 @@ from servobench.plant.contract.signals import Observation, trusted_observation
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
 
-PROBLEMS, BLOCK, FACTOR, AGREEMENT = 60, 128, 10.0, 5e-4  # IPOPT stops some 1e-4 rad short: its barrier
+# IPOPT stops some 1e-4 rad short: its barrier
+PROBLEMS, BLOCK, FACTOR, AGREEMENT = (60, 128, 10.0, 5e-4)
 CONFIG = MpcConfig()
 BLOCK_TIME = CONFIG.horizon_time / CONFIG.moves  # [s] a period of the problem
 SHARES = decay_shares(CONFIG.moves, CONFIG.decay * BLOCK_TIME)
@@ -57,10 +58,16 @@ class DoMpc:
         import do_mpc
 
         model = do_mpc.model.Model("discrete", "SX")
-        shift, q = model.set_variable("_x", "shift", (SPEC.m, 1)), model.set_variable("_x", "q", (SPEC.n, 1))
+        shift, q = (
+            model.set_variable("_x", "shift", (SPEC.m, 1)),
+            model.set_variable("_x", "q", (SPEC.n, 1)),
+        )
         dq = model.set_variable("_u", "dq", (SPEC.n, 1))
         J = model.set_variable("_tvp", "J", (SPEC.m, SPEC.n))
-        target, weight = model.set_variable("_tvp", "target", (SPEC.m, 1)), model.set_variable("_tvp", "weight", (1, 1))
+        target, weight = (
+            model.set_variable("_tvp", "target", (SPEC.m, 1)),
+            model.set_variable("_tvp", "weight", (1, 1)),
+        )
         model.set_rhs("shift", shift + J @ dq)
         model.set_rhs("q", q + dq)
         model.setup()
@@ -73,8 +80,14 @@ class DoMpc:
         self._mpc.set_objective(mterm=track, lterm=track + 0.5 * CONFIG.move_weight * (dq.T @ dq))
         self._mpc.set_rterm(dq=0.0)
         largest = SPEC.joint_velocity_limit * SPEC.period
-        self._mpc.bounds["lower", "_u", "dq"], self._mpc.bounds["upper", "_u", "dq"] = -largest, largest
-        self._mpc.bounds["lower", "_x", "q"], self._mpc.bounds["upper", "_x", "q"] = SPEC.joint_lower, SPEC.joint_upper
+        self._mpc.bounds["lower", "_u", "dq"], self._mpc.bounds["upper", "_u", "dq"] = (
+            -largest,
+            largest,
+        )
+        self._mpc.bounds["lower", "_x", "q"], self._mpc.bounds["upper", "_x", "q"] = (
+            SPEC.joint_lower,
+            SPEC.joint_upper,
+        )
         self._template = self._mpc.get_tvp_template()
         self._mpc.set_tvp_fun(lambda _time: self._template)
         self._mpc.setup()
@@ -100,7 +113,9 @@ def block_time(law: MpcLaw) -> float:
     chosen = [problems()[i % PROBLEMS] for i in range(BLOCK)]
     J, q, y, reference = (
         np.array(column)
-        for column in zip(*((J, seen.joint_position, seen.feature, ref) for J, seen, ref in chosen), strict=True)
+        for column in zip(
+            *((J, seen.joint_position, seen.feature, ref) for J, seen, ref in chosen), strict=True
+        )
     )
     valid = np.ones(y.shape, dtype=np.bool_)
     observation = trusted_observation(0.0, q, y, valid[:, 0], valid)
@@ -115,11 +130,14 @@ def main() -> None:
         SystemExit: the answers differ, or the ratio is below the wanted one.
     """
     count = 3 if asked_to_be_quick(__doc__) else PROBLEMS
-    warnings.simplefilter("ignore")  # do-mpc tells of optional parts, CasADi of do-mpc's use of numpy
+    # Do-mpc tells of optional parts, CasADi of do-mpc's use of numpy
+    warnings.simplefilter("ignore")
     try:
         other = DoMpc()
     except ImportError as error:
-        print(f"The comparison with do-mpc is left out: {error}; `pip install do-mpc` into this environment.\n")
+        print(
+            f"The comparison with do-mpc is left out: {error}; `pip install do-mpc` into this environment.\n"
+        )
         return
     law = MpcLaw(CONFIG, RobotKnowledge(SPEC, CONFIG.moves))
     state = law.start(problems()[0][1])
@@ -143,7 +161,9 @@ def main() -> None:
     print(table(["predictive step with limits", "a step", "do-mpc / this"], rows))
     print(f"Largest difference of a joint step: {difference:.1e} rad.\n")
     if difference > AGREEMENT:
-        sys.exit(f"the joint steps differ by more than {AGREEMENT:g} rad: it is not the same problem")
+        sys.exit(
+            f"the joint steps differ by more than {AGREEMENT:g} rad: it is not the same problem"
+        )
     if theirs < FACTOR * own:
         sys.exit(f"mpc_step is {theirs / own:.1f} times faster than do-mpc, wanted {FACTOR:g}")
 

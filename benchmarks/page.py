@@ -31,20 +31,28 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 def run(script: str, *options: str) -> str | None:
     """Return what a benchmark prints, None if it fails."""
-    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": str(ROOT / ".package")}
+    environment = {
+        **os.environ,
+        **dict.fromkeys(THREADS, "1"),
+        "PYTHONPATH": str(ROOT / ".package"),
+    }
     command = [sys.executable, str(ROOT / "benchmarks" / f"{script}.py"), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         sys.stderr.write(f"{script} failed: {done.stderr.strip()}\n")
         return None
-    return "\n".join(line for line in done.stdout.splitlines() if not line.startswith("pybullet build")).strip()
+    return "\n".join(
+        line for line in done.stdout.splitlines() if not line.startswith("pybullet build")
+    ).strip()
 
 
 def machine() -> str:
     """Return machine, date and versions."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    versions = {"Python": platform.python_version()} | {library: installed_version(library) for library in LIBRARIES}
+    versions = {"Python": platform.python_version()} | {
+        library: installed_version(library) for library in LIBRARIES
+    }
     return (
         f"Machine: {next(names, platform.machine())}, {os.cpu_count()} processors, {platform.system()} "
         f"{platform.machine()}; {datetime.datetime.now(tz=datetime.UTC):%Y-%m-%d}.\n"
@@ -59,10 +67,16 @@ def main() -> None:
         quick=measuring.QUICK,
         against={"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"},
         out={"type": Path, "default": ROOT / "docs"},
-        only={"nargs": "*", "metavar": "SCRIPT", "help": "benchmarks to run, such as limits; default: all"},
+        only={
+            "nargs": "*",
+            "metavar": "SCRIPT",
+            "help": "benchmarks to run, such as limits; default: all",
+        },
     )
     pictures = options.out / "pictures"
-    extra = {each: ["--picture", f"{pictures}/performance_{each}.png"] for each in ("shares", "scaling")}
+    extra = {
+        each: ["--picture", f"{pictures}/performance_{each}.png"] for each in ("shares", "scaling")
+    }
     extra["throughput"] = ["--against", *options.against]
     kept, failed = (options.out if options.quick else ROOT / "build") / "benchmarks", []
     kept.mkdir(parents=True, exist_ok=True)
@@ -72,7 +86,9 @@ def main() -> None:
         last = kept / f"{script}.md"
         if not options.only or script in options.only:
             quick = ["--quick"] if options.quick else []
-            printed = machine() if script == "machine" else run(script, *extra.get(script, []), *quick)
+            printed = (
+                machine() if script == "machine" else run(script, *extra.get(script, []), *quick)
+            )
             sys.stderr.write(f"{script}: {time.perf_counter() - began:.0f} s\n")
             if printed is None:
                 failed.append(script)

@@ -49,7 +49,11 @@ def columns(log: Logged, kind: str) -> list[str]:
 def changed(log: Logged, kind: str, change: Callable[[Any], Any]) -> Logged:
     """Return a log with an array of columns, (k, *), changed."""
     names = columns(log, kind)
-    return log._replace(table=log.table.assign(**dict(zip(names, change(log.table[names].to_numpy()).T, strict=True))))
+    return log._replace(
+        table=log.table.assign(
+            **dict(zip(names, change(log.table[names].to_numpy()).T, strict=True))
+        )
+    )
 
 
 def joints(change: Callable[[Any], Any]) -> Change:
@@ -79,18 +83,28 @@ def exchanged(log: Logged) -> Logged:
 def alphabetical(log: Logged) -> Logged:
     """Write joints in alphabetical order."""
     order = np.argsort(find_robot(log.robot).nominal.arm.joint_names)
-    return log if (np.diff(order) == 1).all() else changed(log, "joint_position", lambda q: q[:, order])
+    return (
+        log
+        if (np.diff(order) == 1).all()
+        else changed(log, "joint_position", lambda q: q[:, order])
+    )
 
 
 def drifting(log: Logged) -> Logged:
     """Write frames later and later, by 2 ms a second."""
     time = log.table["time_s"].to_numpy()
-    return changed(log, "feature", lambda y: y - 0.002 * time[:, None] * np.gradient(y, time, axis=0))
+    return changed(
+        log, "feature", lambda y: y - 0.002 * time[:, None] * np.gradient(y, time, axis=0)
+    )
 
 
 def moved(log: Logged) -> Logged:
     """Move the camera by 50 mm after 30 s."""
-    return changed(log, "feature", lambda y: y + 0.05 * (log.table["time_s"].to_numpy()[:, None] > 30.0) * (1, 0, 0))
+    return changed(
+        log,
+        "feature",
+        lambda y: y + 0.05 * (log.table["time_s"].to_numpy()[:, None] > 30.0) * (1, 0, 0),
+    )
 
 
 def repeated(log: Logged) -> Logged:
@@ -114,7 +128,10 @@ MISTAKES: Final[dict[str, tuple[Change, str]]] = {
     "clocks drift": (drifting, "clocks of camera and joints drift"),
     "frames repeat": (repeated, "frames repeat another one"),
     "rows missing": (with_gap, "rows must be the control period"),
-    "another arm": (lambda log: log._replace(robot=TWINS[log.robot]) if log.robot in TWINS else log, "the arm is a"),
+    "another arm": (
+        lambda log: log._replace(robot=TWINS[log.robot]) if log.robot in TWINS else log,
+        "the arm is a",
+    ),
     "camera moved": (moved, "camera or the ball was moved"),
 }
 
@@ -126,7 +143,11 @@ def logged(seed: int) -> Logged:
         "docs/examples/excite.py", task="random", robot=robot, mismatch=mismatch, seed=seed,
         settings={"kinematic": sections, "random": {"duration": 60.0}, "Excite": {"swing": 0.25}},
     )  # fmt: skip
-    kept = [name for name in made.steps if re.match("time_s|joint_position|joint_velocity|feature", name)]
+    kept = [
+        name
+        for name in made.steps
+        if re.match("time_s|joint_position|joint_velocity|feature", name)
+    ]
     return Logged(made.steps[kept], robot, 1 + seed % 4)
 
 
@@ -139,8 +160,14 @@ def said(log: Logged, folder: Path) -> str:
     except ConfigurationError as error:
         return str(error)
     own, model = find_robot(log.robot), find_sensing("position").nominal(find_robot(log.robot))
-    others = {name: find_robot(name).nominal for name in ROBOTS if name != log.robot and find_robot(name).n == own.n}
-    return mistakes(read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * np.pi), log.table), model, lambda: others)[0]
+    others = {
+        name: find_robot(name).nominal
+        for name in ROBOTS
+        if name != log.robot and find_robot(name).n == own.n
+    }
+    return mistakes(
+        read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * np.pi), log.table), model, lambda: others
+    )[0]
 
 
 def planted(seed: int, folder: Path, pairs: int) -> list[dict[str, Any]]:
@@ -157,7 +184,16 @@ def planted(seed: int, folder: Path, pairs: int) -> list[dict[str, Any]]:
         line = said(MISTAKES[second][0](MISTAKES[first][0](clean)), folder)
         one, other = (MISTAKES[name][1] in line for name in (first, second))
         named = (one and (other or alone[second])) or (other and alone[first])
-        rows.append({"seed": seed, "first": first, "second": second, "named": named, "one": one or other, "line": line})
+        rows.append(
+            {
+                "seed": seed,
+                "first": first,
+                "second": second,
+                "named": named,
+                "one": one or other,
+                "line": line,
+            }
+        )
     return rows
 
 
@@ -172,14 +208,19 @@ def main() -> None:
         out={"type": Path, "help": "CSV file for a row a log"},
     )
     with tempfile.TemporaryDirectory() as folder:
-        lines = [said(logged(seed), Path(folder)) for seed in range(given.first, given.first + given.clean)]
+        lines = [
+            said(logged(seed), Path(folder))
+            for seed in range(given.first, given.first + given.clean)
+        ]
         rows = []
         for seed in range(given.first, given.first + given.logs):
             rows += planted(seed, Path(folder), given.pairs)
             if given.out is not None:
                 pd.DataFrame(rows).to_csv(given.out, index=False)
     if lines:
-        print(f"{len(lines)} clean logs, {sum(map(bool, lines))} with a line: {[line for line in lines if line]}")
+        print(
+            f"{len(lines)} clean logs, {sum(map(bool, lines))} with a line: {[line for line in lines if line]}"
+        )
     if rows:
         table = pd.DataFrame(rows)
         single = table[table["second"] == ""]
@@ -187,7 +228,9 @@ def main() -> None:
         pairs = table[table["second"] != ""]
         if len(pairs):
             one, both = pairs["one"].mean(), pairs["named"].mean()
-            print(f"{len(pairs)} pairs: one named in {one:.1%}, and the other one after its remedy in {both:.1%}")
+            print(
+                f"{len(pairs)} pairs: one named in {one:.1%}, and the other one after its remedy in {both:.1%}"
+            )
         missed = table[~table["named"].astype(bool)]
         print(missed[["seed", "first", "second", "line"]].to_string(max_colwidth=140))
 

@@ -83,7 +83,15 @@ def row(word: str, poses: int, robots: int) -> list[str]:
 def main() -> None:
     """Print a row for each set-up."""
     poses, robots = (4, 1) if asked_to_be_quick(__doc__) else (POSES, ROBOTS)
-    header = ["`--sensing`", "marks found", "median error, px", "95 %", "largest", "wrong associations", "ms a look"]
+    header = [
+        "`--sensing`",
+        "marks found",
+        "median error, px",
+        "95 %",
+        "largest",
+        "wrong associations",
+        "ms a look",
+    ]
     print(table(header, [row(word, poses, robots) for word in SET_UPS]))
 
 

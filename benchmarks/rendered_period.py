@@ -34,12 +34,15 @@ ROBOT = find_robot("ur5")
 HOME, MODEL = np.array(ur5.HOME), ROBOT.nominal
 PERIOD = 0.05  # [s]
 STEPS = whole_steps(PERIOD, PHYSICS_STEP)
-Calls = dict[str, Callable[[FloatArray], object]]  # of joint velocities [rad/s], by name; the bare calls first
+# of joint velocities [rad/s], by name; the bare calls first
+Calls = dict[str, Callable[[FloatArray], object]]
 
 
 def window_of_ball(scene: Scene) -> Window:
     """Return the window of the image around the ball of a scene."""
-    window = window_around(MODEL.to_camera(scene.ball_position()), ROBOT.workspace.ball_radius, CAMERA)
+    window = window_around(
+        MODEL.to_camera(scene.ball_position()), ROBOT.workspace.ball_radius, CAMERA
+    )
     assert window is not None, "the ball at HOME is in the image"
     return window
 
@@ -51,7 +54,10 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     from servobench.plant.rendered.bullet import BulletScene, BulletSimulation
 
     plant = opened.enter_context(closing(BULLET.build(config, PlantSetup(MODEL, HOME, PERIOD))))
-    scenes = [opened.enter_context(closing(BulletScene(Room(MODEL.arm, config.scenery, ROBOT)))) for _ in range(2)]
+    scenes = [
+        opened.enter_context(closing(BulletScene(Room(MODEL.arm, config.scenery, ROBOT))))
+        for _ in range(2)
+    ]
     stops = np.full(6, np.pi)
     machine = Machine(MODEL.arm, ROBOT, (), config.drives, config.lag, HOME, (-stops, stops))
     mechanics = opened.enter_context(closing(BulletSimulation(machine)))
@@ -62,10 +68,17 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     window = window_of_ball(scenes[0])
     plain, plain_arm = scenes[1]._world.client, scenes[1]._arm
     pybullet.setPhysicsEngineParameter(fixedTimeStep=PHYSICS_STEP, physicsClientId=plain)
-    matrices = [each.T.ravel().tolist() for each in (view_matrix(MODEL.X_BC), camera.projection_matrix())]
+    matrices = [
+        each.T.ravel().tolist() for each in (view_matrix(MODEL.X_BC), camera.projection_matrix())
+    ]
 
     def bare(_: FloatArray) -> None:
-        client, arm, theta, rest = mechanics._world.client, mechanics._arm, list(ur5.HOME), [0.0] * 6
+        client, arm, theta, rest = (
+            mechanics._world.client,
+            mechanics._arm,
+            list(ur5.HOME),
+            [0.0] * 6,
+        )
         for step in range(STEPS):
             pybullet.calculateMassMatrix(arm, theta, physicsClientId=client)
             for _ in range(2):
@@ -83,14 +96,23 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
                 )  # fmt: skip
             pybullet.stepSimulation(physicsClientId=plain)
         width, height, rgba, depth, _ = pybullet.getCameraImage(
-            camera.width, camera.height, *matrices, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=plain
+            camera.width,
+            camera.height,
+            *matrices,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=plain,
         )
         picture = np.reshape(rgba, (height, width, 4)).astype(np.float64) / 255.0
         red = (picture[..., 0] > 0.5) & (picture[..., 1] < 0.3) & (picture[..., 2] < 0.3)
         rows, columns = np.nonzero(red)
         near = np.reshape(depth, (height, width))[red]
-        joints = [pybullet.getJointState(plain_arm, joint, physicsClientId=plain)[0] for joint in range(len(action))]
-        return np.array(joints), np.array([columns.mean(), rows.mean(), near.mean()]) if len(rows) else np.zeros(3)
+        joints = [
+            pybullet.getJointState(plain_arm, joint, physicsClientId=plain)[0]
+            for joint in range(len(action))
+        ]
+        return np.array(joints), np.array([columns.mean(), rows.mean(), near.mean()]) if len(
+            rows
+        ) else np.zeros(3)
 
     return {
         "bare calls": bare,
@@ -127,7 +149,10 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
                 mujoco.mj_collision(shapes, placed)
         scene.draw(CAMERA, MODEL.X_BC, window)
 
-    return {"bare calls": lambda _: bare(), "`Bench.step`": lambda speed: plant.step(Command(speed))}
+    return {
+        "bare calls": lambda _: bare(),
+        "`Bench.step`": lambda speed: plant.step(Command(speed)),
+    }
 
 
 def rows(make: Callable[[RenderedConfig, ExitStack], Calls], repeats: int) -> list[list[str]]:
@@ -137,7 +162,10 @@ def rows(make: Callable[[RenderedConfig, ExitStack], Calls], repeats: int) -> li
         with ExitStack() as opened:
             calls = make(config, opened)
             speeds = [0.2 * np.sin(0.3 * k) * np.ones(6) for k in range(repeats)]
-            rounds = [times_in_turns({name: partial(call, u) for name, call in calls.items()}, 1) for u in speeds]
+            rounds = [
+                times_in_turns({name: partial(call, u) for name, call in calls.items()}, 1)
+                for u in speeds
+            ]
         medians = 1e3 * np.median([[time for (time,) in each.values()] for each in rounds], axis=0)
         for name, value in zip(calls, medians, strict=True):
             found.setdefault(name, [name]).extend((f"{value:.2f} ms", f"{value / medians[0]:.2f}"))
@@ -147,9 +175,17 @@ def rows(make: Callable[[RenderedConfig, ExitStack], Calls], repeats: int) -> li
 def main() -> None:
     """Print a table for each engine that is installed."""
     repeats = 3 if asked_to_be_quick(__doc__) else 200
-    for name, module, make in (("bullet", "pybullet", bullet_calls), ("mujoco", "mujoco", mujoco_calls)):
+    for name, module, make in (
+        ("bullet", "pybullet", bullet_calls),
+        ("mujoco", "mujoco", mujoco_calls),
+    ):
         if find_spec(module) is not None:
-            print(table([f"period of `{name}`", "with scenery", "× bare", "without", "× bare"], rows(make, repeats)))
+            print(
+                table(
+                    [f"period of `{name}`", "with scenery", "× bare", "without", "× bare"],
+                    rows(make, repeats),
+                )
+            )
 
 
 if __name__ == "__main__":

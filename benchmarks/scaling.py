@@ -46,7 +46,9 @@ def linear_spec(n: int) -> PlantSpec:
 def seen(k: int, q: np.ndarray, y: np.ndarray) -> Observation:
     """Return what is observed in period k; every feature is valid."""
     lead = q.shape[:-1]
-    return trusted_observation(k * PERIOD, q, y, np.ones(lead, dtype=np.bool_)[()], np.ones(y.shape, dtype=np.bool_))
+    return trusted_observation(
+        k * PERIOD, q, y, np.ones(lead, dtype=np.bool_)[()], np.ones(y.shape, dtype=np.bool_)
+    )
 
 
 def side_by_side(counts: Sequence[int]) -> Curves:
@@ -89,7 +91,9 @@ def plan(lead: Lead, horizon: int, reach: float) -> Callable[[], object]:
     rng, n = np.random.default_rng(0), 6
     J, zero = rng.normal(scale=0.4, size=(*lead, FEATURES, n)), np.zeros((*lead, FEATURES))
     spec = linear_spec(n)
-    law = MpcLaw(MpcConfig(horizon_time=horizon * spec.period, moves=horizon), RobotKnowledge(spec, horizon))
+    law = MpcLaw(
+        MpcConfig(horizon_time=horizon * spec.period, moves=horizon), RobotKnowledge(spec, horizon)
+    )
     observation = seen(0, np.zeros((*lead, n)), zero)
     reference = np.repeat(zero[..., None, :] + reach, horizon + 1, axis=-2)
     state = law.start(observation)
@@ -101,7 +105,9 @@ def loop(lead: Lead, n: int, method: str) -> Callable[[], object]:
     rng, entry, k = np.random.default_rng(0), find_controller(method), 0
     J = rng.normal(scale=0.4, size=(FEATURES, n))
     nominal = lambda q: np.broadcast_to(J, (*q.shape[:-1], *J.shape))  # noqa: E731
-    controller: Any = entry.build(default_config(entry), RobotKnowledge(linear_spec(n), PREVIEW, nominal))
+    controller: Any = entry.build(
+        default_config(entry), RobotKnowledge(linear_spec(n), PREVIEW, nominal)
+    )
     q, noise = rng.normal(size=(*lead, n)), 1e-3 * rng.normal(size=(16, *lead, FEATURES))
     goals = [np.matvec(J, q + 0.3 * rng.normal(size=q.shape)) for _ in range(2)]
     references = [np.repeat(goal[..., None, :], PREVIEW + 1, axis=-2) for goal in goals]
@@ -110,16 +116,26 @@ def loop(lead: Lead, n: int, method: str) -> Callable[[], object]:
     def step() -> None:
         nonlocal state, q, k
         k += 1
-        state, u = controller.servo.step(state, seen(k, q, np.matvec(J, q) + noise[k % 16]), references[k // 10 % 2])
+        state, u = controller.servo.step(
+            state, seen(k, q, np.matvec(J, q) + noise[k % 16]), references[k // 10 % 2]
+        )
         q = q + PERIOD * u
 
     return step
 
 
-def curve(make: Callable[..., Callable[[], object]], lead: Lead, sizes: Sequence[int], calls: int, *more: Any) -> Curve:  # noqa: ANN401
+def curve(
+    make: Callable[..., Callable[[], object]],
+    lead: Lead,
+    sizes: Sequence[int],
+    calls: int,
+    *more: Any,  # noqa: ANN401
+) -> Curve:
     """Return the cost of what `make(lead, size, *more)` returns, for one run."""
     calls = max(calls // 6, 2) if lead else calls
-    return list(sizes), [processor_time(make(lead, size, *more), calls) / (*lead, 1)[0] for size in sizes]
+    return list(sizes), [
+        processor_time(make(lead, size, *more), calls) / (*lead, 1)[0] for size in sizes
+    ]
 
 
 def sides(lead: Lead) -> str:
@@ -131,13 +147,19 @@ def draw(panels: dict[str, tuple[str, Curves]], path: Path) -> None:
     """Draw a panel for each size."""
     with style.figure_style():
         figure = Figure(figsize=(measuring.WIDTH, 6.4), layout="constrained")
-        for axes, (title, (unit, curves)) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
+        for axes, (title, (unit, curves)) in zip(
+            figure.subplots(2, 2).flat, panels.items(), strict=True
+        ):
             styles = style.method_styles(label.split("`")[1] for label in curves)
             for label, (sizes, costs) in curves.items():
-                look = styles[label.split("`")[1]].line_arguments(8) | {"linestyle": ":" if "one run" in label else "-"}
+                look = styles[label.split("`")[1]].line_arguments(8) | {
+                    "linestyle": ":" if "one run" in label else "-"
+                }
                 if "limits active" in label:
                     look |= {"color": style.VERMILION}
-                axes.loglog(sizes, [1e6 * cost for cost in costs], **look, label=label.replace("`", ""))
+                axes.loglog(
+                    sizes, [1e6 * cost for cost in costs], **look, label=label.replace("`", "")
+                )
             axes.set_xticks(sizes, map(str, sizes))
             axes.minorticks_off()
             axes.set(title=title, xlabel=unit, ylabel="µs a run and period")
@@ -149,7 +171,11 @@ def main() -> None:
     """Print a table of exponents, and the picture's line."""
     given = measuring.options(__doc__, quick=measuring.QUICK, picture={"type": Path})
     count, calls = (2, 2) if given.quick else (None, 60)
-    sizes = {"units": (50, 100, 150, 300, 600), "horizon": (4, 7, 10, 20, 40), "joints": (3, 6, 12, 24)}
+    sizes = {
+        "units": (50, 100, 150, 300, 600),
+        "horizon": (4, 7, 10, 20, 40),
+        "joints": (3, 6, 12, 24),
+    }
     units, horizons, joints = (each[:count] for each in sizes.values())
     panels = {
         "runs side by side": ("runs", side_by_side([2**i for i in range(10)][:count])),

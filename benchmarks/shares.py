@@ -25,12 +25,13 @@ COLOURS = {
     "plant": style.BLUE, "estimator": style.VERMILION, "law": style.ORANGE, "aids": style.GREEN,
     "log, judging": style.YELLOW, "building": style.WINE, "rest": "#BBBBBB",
 }  # fmt: skip
+# Functions that all methods share
 SHARED = (
     (episode, ("build", "build_together"), "building"),
     (episode, ("judge_run", "_judge_together"), "log, judging"),
     (log.StepLog, ("add", "steps"), "log, judging"),
     (Bench, ("reset", "step", "truth"), "plant"),
-)  # functions that all methods share
+)
 Costs = dict[str, dict[str, float]]  # [µs a period] by method and part
 
 
@@ -122,7 +123,10 @@ def main() -> None:
     for owner, names, part in SHARED:
         for name in names:
             clock.wrap(owner, name, part)
-    sides = {"alone": measure(clock, runs, together=False), "block": measure(clock, block, together=True)}
+    sides = {
+        "alone": measure(clock, runs, together=False),
+        "block": measure(clock, block, together=True),
+    }
     rows = [
         [side, f"`{method}`", *(f"{value:.1f}" for value in (*parts.values(), sum(parts.values())))]
         for side, costs in sides.items()

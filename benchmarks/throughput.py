@@ -40,15 +40,34 @@ print(time.process_time() - began)
 def surroundings(checkout: Path) -> tuple[str, dict[str, Any]]:
     """Return the Python of a checkout, its own where it has one, and the environment and folder of its processes."""
     own, packages = checkout / ".venv" / "bin" / "python", checkout / ".package"
-    environment = {**os.environ, "PYTHONPATH": str(packages if packages.is_dir() else checkout), "OMP_NUM_THREADS": "1"}
-    return str(own if own.exists() and checkout != HERE else sys.executable), {"env": environment, "cwd": checkout}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(packages if packages.is_dir() else checkout),
+        "OMP_NUM_THREADS": "1",
+    }
+    return str(own if own.exists() and checkout != HERE else sys.executable), {
+        "env": environment,
+        "cwd": checkout,
+    }
 
 
-def sweep(checkout: Path, plant: str, methods: str, robots: int, workers: int = 1) -> tuple[float, float]:
+def sweep(
+    checkout: Path, plant: str, methods: str, robots: int, workers: int = 1
+) -> tuple[float, float]:
     """Return the processor time with all processes, and the wall-clock time, of a sweep [s]."""
     python, around = surroundings(checkout)
     module = "servobench" if (checkout / ".package").is_dir() else "harness.command_line"
-    names = "-m", module, "sweep", "--plants", plant, "--controllers", methods, "--workers", str(workers)
+    names = (
+        "-m",
+        module,
+        "sweep",
+        "--plants",
+        plant,
+        "--controllers",
+        methods,
+        "--workers",
+        str(workers),
+    )
     return sweep_times([python, *names, "--seeds", seeds(robots)], **around)
 
 
@@ -66,7 +85,9 @@ def period_alone(checkout: Path, plant: str, method: str, runs: int) -> float:
     return float(printed.split()[-1]) / runs / PERIODS
 
 
-def ratio(cost: Callable[..., float], now: float, checkout: Path, plant: str, method: str, *sizes: int) -> str:
+def ratio(
+    cost: Callable[..., float], now: float, checkout: Path, plant: str, method: str, *sizes: int
+) -> str:
     """Return what a method cost in an older checkout over what it costs now; a dash where it did not exist.
 
     Before methods had aids, the one that is now called `ukf_mfac:published` was `ukf_mfac`.
@@ -81,11 +102,21 @@ def main() -> None:
     """Print a table of times and ratios, and the time of the whole."""
     against = {"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"}
     given = options(__doc__, quick=QUICK, against=against, rounds=(1, "of this checkout"))
-    others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in given.against)}
+    others = {
+        name: Path(path).resolve()
+        for name, _, path in (each.partition("=") for each in given.against)
+    }
     plants, methods = ["kinematic", "fmu"], list(METHODS)
     counts, old_counts, alone, rounds = (256, 1280), (4, 84), 15, given.rounds
     if given.quick:
-        plants, methods, counts, old_counts, alone, rounds = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1
+        plants, methods, counts, old_counts, alone, rounds = (
+            plants[:1],
+            methods[:1],
+            (2, 10),
+            (2, 4),
+            1,
+            1,
+        )
     rows = []
     for plant in plants:
         for method in methods:
@@ -93,7 +124,9 @@ def main() -> None:
             single = min(period_alone(HERE, plant, method, alone) for _ in range(rounds))
             cells = [f"{1e6 * now:.1f} µs", f"{microseconds(single)} µs"]
             for checkout in others.values():
-                cells.append(f"**{ratio(period_in_sweep, now, checkout, plant, method, *old_counts)}**")
+                cells.append(
+                    f"**{ratio(period_in_sweep, now, checkout, plant, method, *old_counts)}**"
+                )
                 cells.append(ratio(period_alone, single, checkout, plant, method, alone))
             rows.append([plant, f"`{method}`", *cells])
     names = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]

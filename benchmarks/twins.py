@@ -34,7 +34,12 @@ from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import SHORT_NAMES, RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.twin_file import twin_text
-from servobench.harness.studies.challenge import MEASURES, Challenge, challenge_names, find_challenge
+from servobench.harness.studies.challenge import (
+    MEASURES,
+    Challenge,
+    challenge_names,
+    find_challenge,
+)
 from servobench.harness.studies.suite import judge
 from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
@@ -43,7 +48,8 @@ from servobench.plant.robot.mismatch import Mismatch
 
 EQUIPPED: Final = ("regression_mfac", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
 PUBLISHED: Final = tuple(f"{name}:published" for name in EQUIPPED[1:])
-REFERENCES: Final = ("calibrated",)  # which bounds the scores; nmpc_calibrated takes most of the time of a suite
+# Which bounds the scores; nmpc_calibrated takes most of the time of a suite
+REFERENCES: Final = ("calibrated",)
 HIDDEN: Final = (
     Challenge("moves", task="random", measure="settling", reference=REFERENCES),
     Challenge("circle", task="circle", measure="path", reference=REFERENCES),
@@ -67,41 +73,72 @@ class Hidden(NamedTuple):
 
 def hidden_plant(challenge: Challenge, seed: int) -> Hidden:
     """Return a hidden plant of a seed: of a challenge the robot and the world, else those of `hidden_plants`."""
-    short = {name: getattr(challenge, name) for name in SHORT_NAMES if getattr(challenge, name) is not None}
-    settings = {SHORT_NAMES[name].key: value for name, value in short.items()} | flatten(challenge.settings)
+    short = {
+        name: getattr(challenge, name)
+        for name in SHORT_NAMES
+        if getattr(challenge, name) is not None
+    }
+    settings = {SHORT_NAMES[name].key: value for name, value in short.items()} | flatten(
+        challenge.settings
+    )
     if challenge in HIDDEN:
         robot, mismatch, own = draw_hidden(seed, PLANT)
         sensing, times = own["sensing"], {name: own[name] for name in USUAL}
-        return Hidden(robot, mismatch, sensing["latency"], times, sensing["noise_shape"], Mismatch(), settings)
+        return Hidden(
+            robot, mismatch, sensing["latency"], times, sensing["noise_shape"], Mismatch(), settings
+        )
     given = read_mismatch(challenge.mismatch)
     axes = tuple(each for each in given.axes if each[0] in {**SENSOR_AXES, **MECHANICS_AXES})
     words = Mismatch("", axes) if axes else Mismatch()
-    return Hidden("ur5", challenge.mismatch, challenge.latency or 0.0, USUAL, np.eye(3).tolist(), words, settings)
+    return Hidden(
+        "ur5",
+        challenge.mismatch,
+        challenge.latency or 0.0,
+        USUAL,
+        np.eye(3).tolist(),
+        words,
+        settings,
+    )
 
 
 def true_text(plant: Hidden, seed: int) -> str:
     """Return a file of a twin that is the plant itself."""
-    request = RunRequest(PLANT, "constant", "random", read_mismatch(plant.mismatch), seed, robot=plant.robot)
-    true, nominal = draw_robot(request)[0], find_sensing("position").nominal(find_robot(plant.robot))
+    request = RunRequest(
+        PLANT, "constant", "random", read_mismatch(plant.mismatch), seed, robot=plant.robot
+    )
+    true, nominal = (
+        draw_robot(request)[0],
+        find_sensing("position").nominal(find_robot(plant.robot)),
+    )
     shape = 1e-3 * np.array(plant.noise_shape)
     pose = f"{{ frame = 'base', position = {toml(true.camera[:3, 3])}, rotation = {toml(true.camera[:3, :3])} }}"
     lines = [f"robot = {toml(plant.robot)}", f"covariance = {toml(shape @ shape.T)}"]
     lines += ["[camera]", f"latency = {plant.latency}", f"pose = {pose}", "[mean]"]
     mean = parameters(true, nominal) | plant.times
-    return "\n".join([*lines, *(f"{key} = {toml(float(value))}" for key, value in mean.items())]) + "\n"
+    return (
+        "\n".join([*lines, *(f"{key} = {toml(float(value))}" for key, value in mean.items())])
+        + "\n"
+    )
 
 
 def sections(settings: dict[str, Any], task: str) -> dict[str, Any]:
     """Return settings by section, given those by key with roles for the sections."""
     roles = {"run": "run", "plant": PLANT, "task": task}
-    named = {f"{roles[key.partition('.')[0]]}.{key.partition('.')[2]}": value for key, value in settings.items()}
+    named = {
+        f"{roles[key.partition('.')[0]]}.{key.partition('.')[2]}": value
+        for key, value in settings.items()
+    }
     return nest(named)
 
 
 def identified(plant: Hidden, truth: str, seed: int) -> tuple[str, str]:
     """Return the line on a log of a plant, and the file of its twin, empty for a log that is refused."""
     settings = {key: value for key, value in plant.settings.items() if not key.startswith("task.")}
-    given = {"random": {"duration": 60.0}, "Excite": {"swing": 0.25, "fastest": 0.5}, **sections(settings, "random")}
+    given = {
+        "random": {"duration": 60.0},
+        "Excite": {"swing": 0.25, "fastest": 0.5},
+        **sections(settings, "random"),
+    }
     given["run"] = given.get("run", {}) | {"lost_after": 20.0}
     made = servobench.run(
         "docs/examples/excite.py", PLANT, task="random", mismatch=str(plant.words), robot=truth, seed=seed,
@@ -110,30 +147,52 @@ def identified(plant: Hidden, truth: str, seed: int) -> tuple[str, str]:
     if made.row["status"] != "completed":
         return f"the run ended: {made.row['reason']}", ""
     request = RunRequest(PLANT, "constant", "random", plant.words, seed, robot=truth)
-    experiment = build(resolve(request, Settings({key: given[key] for key in given if key != "Excite"})))
+    experiment = build(
+        resolve(request, Settings({key: given[key] for key in given if key != "Excite"}))
+    )
     experiment.plant.close()
     log, own = read_log(experiment.plant.spec, made.steps), find_robot(plant.robot)
-    others = {name: find_robot(name).nominal for name in ROBOTS if name != plant.robot and find_robot(name).n == own.n}
+    others = {
+        name: find_robot(name).nominal
+        for name in ROBOTS
+        if name != plant.robot and find_robot(name).n == own.n
+    }
     said, found = mistakes(log, find_sensing("position").nominal(own), lambda: others)
     if found is None:
         return said, ""
     return said, twin_text(found, log, command_response(log), (plant.robot, "position"))
 
 
-def compared(challenge: Challenge, seed: int, methods: Sequence[str], runs: int, told: bool) -> pd.DataFrame:
+def compared(
+    challenge: Challenge, seed: int, methods: Sequence[str], runs: int, told: bool
+) -> pd.DataFrame:
     """Return a row a method: median and score on a hidden plant and on its twin."""
     plant = hidden_plant(challenge, seed)
-    about = {"challenge": challenge.name, "seed": seed, "robot": plant.robot, "mismatch": plant.mismatch}
+    about = {
+        "challenge": challenge.name,
+        "seed": seed,
+        "robot": plant.robot,
+        "mismatch": plant.mismatch,
+    }
     with tempfile.TemporaryDirectory() as folder:
-        truth, twin = (Path(folder) / f"{name}_{challenge.name}_{seed}.toml" for name in ("truth", "twin"))
+        truth, twin = (
+            Path(folder) / f"{name}_{challenge.name}_{seed}.toml" for name in ("truth", "twin")
+        )
         truth.write_text(true_text(plant, seed), encoding="utf-8")
         said, text = identified(plant, str(truth), seed)
         about["said"] = said
         if not text:
             return pd.DataFrame([about])
         twin.write_text(text, encoding="utf-8")
-        known = {key: value for key, value in plant.settings.items() if told or not key.startswith("plant.sensing")}
-        worlds = ((truth, plant.words, plant.settings), (twin, plant.words if told else Mismatch(), known))
+        known = {
+            key: value
+            for key, value in plant.settings.items()
+            if told or not key.startswith("plant.sensing")
+        }
+        worlds = (
+            (truth, plant.words, plant.settings),
+            (twin, plant.words if told else Mismatch(), known),
+        )
         tables = [
             servobench.compare(
                 [*methods, *challenge.reference], (PLANT,), (challenge.task,), mismatches=(str(words),),
@@ -143,9 +202,13 @@ def compared(challenge: Challenge, seed: int, methods: Sequence[str], runs: int,
         ]  # fmt: skip
     measure = MEASURES[challenge.measure]
     floor = (
-        plant.settings.get("run.period", 0.05) if challenge.measure == "settling" else measure.factor * measure.floor
+        plant.settings.get("run.period", 0.05)
+        if challenge.measure == "settling"
+        else measure.factor * measure.floor
     )
-    real, predicted = (judge(challenge, table).groupby("controller", sort=False) for table in tables)
+    real, predicted = (
+        judge(challenge, table).groupby("controller", sort=False) for table in tables
+    )
     rows = [
         about | {"controller": name, "tie": floor}
         | {f"{what}_{kind}": value for what, group in (("real", real), ("twin", predicted))
@@ -174,7 +237,9 @@ def is_within(table: pd.DataFrame) -> "pd.Series[bool]":
 
 def rank_violation(place: pd.DataFrame) -> float:
     """Return the mean maximum rank violation over the methods of a plant."""
-    real, twin, median = (place[name].to_numpy() for name in ("real_score", "twin_score", "real_median"))
+    real, twin, median = (
+        place[name].to_numpy() for name in ("real_score", "twin_score", "real_median")
+    )
     with np.errstate(invalid="ignore"):
         tie = np.abs(median[:, None] - median) <= place["tie"].iloc[0]
     wrong = ((twin[:, None] < twin) != (real[:, None] < real)) & ~tie
@@ -188,7 +253,11 @@ def report(table: pd.DataFrame) -> str:
     for name, all_of in table.groupby("challenge", sort=False):
         own = known[known["challenge"] == name]
         plants = own.groupby("seed")
-        row = {"challenge": name, "plants": all_of["seed"].nunique(), "refused": int(all_of["real_score"].isna().sum())}
+        row = {
+            "challenge": name,
+            "plants": all_of["seed"].nunique(),
+            "refused": int(all_of["real_score"].isna().sum()),
+        }
         if len(own):
             means = own.groupby("controller")[["real_score", "twin_score"]].mean()
             row |= {
@@ -205,7 +274,9 @@ def report(table: pd.DataFrame) -> str:
     if len(known):
         r = np.corrcoef(known["real_score"], known["twin_score"])[0, 1]
         mmrv = known.groupby(["challenge", "seed"]).apply(rank_violation).mean()
-        texts.append(f"all: {is_within(known).mean():.1%} of {len(known)} pairs within, MMRV {mmrv:.3f}, r {r:.3f}")
+        texts.append(
+            f"all: {is_within(known).mean():.1%} of {len(known)} pairs within, MMRV {mmrv:.3f}, r {r:.3f}"
+        )
     return "\n".join(texts)
 
 
@@ -221,9 +292,15 @@ def main() -> None:
         told={"action": "store_true", "help": "give the twin the words of the world, too"},
         out={"type": Path, "help": "CSV file for a row a method and plant"},
     )
-    chosen = [find_challenge(name) for name in given.challenges.split(",") if name not in ("", "all")]
+    chosen = [
+        find_challenge(name) for name in given.challenges.split(",") if name not in ("", "all")
+    ]
     if given.challenges == "all":
-        chosen = [each for each in map(find_challenge, challenge_names()) if each.grade.name in ("II", "III")]
+        chosen = [
+            each
+            for each in map(find_challenge, challenge_names())
+            if each.grade.name in ("II", "III")
+        ]
     chosen = [replace(each, reference=REFERENCES) for each in chosen] or HIDDEN
     methods = [*EQUIPPED, *PUBLISHED] if given.methods == "all" else given.methods.split(",")
     tables = []

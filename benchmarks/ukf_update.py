@@ -43,7 +43,9 @@ def split(data: list[tuple[np.ndarray, np.ndarray]], lead: tuple[int, ...] = ())
     """Run the project's split filter for runs side by side, or for one, and return vec(J) of the first."""
     J, P = np.zeros((*lead, M, N)), np.broadcast_to(P0[:N, :N], (*lead, N, N)).copy()
     for dq, dy in data:
-        J, P = split_update(J, P + q * np.eye(N), np.tile(dq, (*lead, 1)), np.tile(dy, (*lead, 1)), r=r)
+        J, P = split_update(
+            J, P + q * np.eye(N), np.tile(dq, (*lead, 1)), np.tile(dy, (*lead, 1)), r=r
+        )
     return J.reshape(-1, SIZE)[0]
 
 
@@ -52,7 +54,9 @@ def filterpy_filter(data: list[tuple[np.ndarray, np.ndarray]], *, redraw: bool) 
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
     points = MerweScaledSigmaPoints(SIZE, alpha=1.0, beta=2.0, kappa=0.0)
-    ukf = UnscentedKalmanFilter(SIZE, M, 1.0, hx=lambda x, dq: x.reshape(M, N) @ dq, fx=lambda x, dt: x, points=points)
+    ukf = UnscentedKalmanFilter(
+        SIZE, M, 1.0, hx=lambda x, dq: x.reshape(M, N) @ dq, fx=lambda x, dt: x, points=points
+    )
     ukf.P, ukf.Q, ukf.R = P0.copy(), Q.copy(), R.copy()
     for dq, dy in data:
         ukf.predict()
@@ -68,7 +72,9 @@ def main() -> None:
     try:
         import filterpy  # noqa: F401 - only to see whether it is there
     except ImportError as error:
-        print(f"The comparison with filterpy is left out: {error}; `pip install filterpy` into this environment.\n")
+        print(
+            f"The comparison with filterpy is left out: {error}; `pip install filterpy` into this environment.\n"
+        )
         return
     data = motions()
     reference = filterpy_filter(data, redraw=True)
@@ -77,8 +83,14 @@ def main() -> None:
     calls = {"filterpy": partial(filterpy_filter, data, redraw=False)}
     calls |= {name: partial(run, data) for name, run in own.items()}
     measured = times_in_turns(calls, rounds, time.perf_counter)
-    times = {name: min(each) / MOTIONS / (BLOCK if name == BESIDE else 1) for name, each in measured.items()}
-    rows = [[name, f"{1e6 * each:.1f} µs", f"{times['filterpy'] / each:.1f}"] for name, each in times.items()]
+    times = {
+        name: min(each) / MOTIONS / (BLOCK if name == BESIDE else 1)
+        for name, each in measured.items()
+    }
+    rows = [
+        [name, f"{1e6 * each:.1f} µs", f"{times['filterpy'] / each:.1f}"]
+        for name, each in times.items()
+    ]
     print(table(["unscented update of a 3 × 6 Jacobian", "an update", "filterpy / this"], rows))
     print(f"Largest difference of an entry of J after {MOTIONS} motions: {worst:.1e} m/rad.\n")
     if worst > 1e-9:

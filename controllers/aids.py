@@ -13,7 +13,14 @@ from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias, TypeVar,
 
 from annotated_types import Le
 
-from servobench.plant.contract.settings import Delay, Deviation, NonNegative, Positive, Share, settings
+from servobench.plant.contract.settings import (
+    Delay,
+    Deviation,
+    NonNegative,
+    Positive,
+    Share,
+    settings,
+)
 
 Known: TypeAlias = Literal["ignored", "identified", "given"]
 """Whether a quantity is left out, identified from the motions of the run, or given by a number."""
@@ -25,7 +32,9 @@ class Switch:
     """Declares a setting that switches an aid; its default leaves the aid out."""
 
     equipped: object  # its value in a best equipped method
-    tuned: tuple[object, ...] = ()  # the values among which tuning chooses; empty where tuning has no choice
+    tuned: tuple[
+        object, ...
+    ] = ()  # the values among which tuning chooses; empty where tuning has no choice
 
 
 @dataclass(frozen=True)
@@ -45,12 +54,15 @@ class AidsConfig:
     """Compensate the camera's latency: pair motions of the feature with joint motions, and predict the feature."""
     response: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
     """Smith predictor: the law acts on the state that the arm reaches once all commands sent are carried out."""
-    noise: Annotated[Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))] = "given"
+    noise: Annotated[
+        Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))
+    ] = "given"
     """The standard deviation of the feature, as `feature_noise` or identified."""
     filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
     """Filter of the feature: the noise that the regression finds in the last frame is taken from it."""
     model: Annotated[
-        Literal["own", "nominal", "regression"], Switch("regression", tuned=("own", "nominal", "regression"))
+        Literal["own", "nominal", "regression"],
+        Switch("regression", tuned=("own", "nominal", "regression")),
     ] = "own"
     """The estimator's own Jacobian, its deviation from the nominal one, or from a regression on the nominal one."""
     feedforward: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
@@ -58,7 +70,8 @@ class AidsConfig:
     posture: Annotated[bool, Switch(equipped=True)] = False
     """Null-space centring: move towards the middle of the working region in the null space of the Jacobian."""
     limit: Annotated[
-        Literal["scale", "clip", "redistribute"], Switch("redistribute", tuned=("scale", "clip", "redistribute"))
+        Literal["scale", "clip", "redistribute"],
+        Switch("redistribute", tuned=("scale", "clip", "redistribute")),
     ] = "scale"
     """Saturation: a command beyond the limits is scaled, clipped by joint, or redistributed to joints with room."""
     longest_delay: Annotated[NonNegative, Le(1.0)] = 0.25
@@ -93,7 +106,10 @@ def _marked(mark: type[Mark]) -> dict[str, Mark]:
     """Return the declarations of this type by setting, in the order of the settings."""
     hints = get_type_hints(AidsConfig, include_extras=True)
     return {
-        key: each for key, hint in hints.items() for each in getattr(hint, "__metadata__", ()) if isinstance(each, mark)
+        key: each
+        for key, hint in hints.items()
+        for each in getattr(hint, "__metadata__", ())
+        if isinstance(each, mark)
     }
 
 
@@ -107,7 +123,9 @@ class _Fixed(dict[str, Any]):
     """A dictionary that cannot be changed."""
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:
-        raise TypeError("servobench.EQUIPPED is shared; change a copy, {**servobench.EQUIPPED, 'posture': False}")
+        raise TypeError(
+            "servobench.EQUIPPED is shared; change a copy, {**servobench.EQUIPPED, 'posture': False}"
+        )
 
     __setitem__ = __delitem__ = update = setdefault = pop = popitem = clear = __ior__ = _refuse
 
@@ -116,14 +134,20 @@ class _Fixed(dict[str, Any]):
         return dict, (dict(self),)
 
 
-EQUIPPED: Final[Mapping[str, Any]] = _Fixed({name: switch.equipped for name, switch in SWITCHES.items()})
+EQUIPPED: Final[Mapping[str, Any]] = _Fixed(
+    {name: switch.equipped for name, switch in SWITCHES.items()}
+)
 """The value of each aid in a best equipped method."""
 
 
 def describe_aids(values: Mapping[str, Any]) -> str:
     """Return which aids a controller has by its settings, whose keys have dots: with all, without, with some."""
     none = AidsConfig()
-    on = [name for name in SWITCHES if values.get(f"aids.{name}", getattr(none, name)) != getattr(none, name)]
+    on = [
+        name
+        for name in SWITCHES
+        if values.get(f"aids.{name}", getattr(none, name)) != getattr(none, name)
+    ]
     off = [name for name in SWITCHES if name not in on]
     if len(on) < len(off):
         return f"with the aids {', '.join(on)} alone" if on else "without aids"

@@ -7,7 +7,9 @@ from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import branch, plus_diagonal
 
 MAX_DAMPED_RATIO = 1e9  # [1] of ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
-MIN_SINGULAR_RATIO = 1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors
+MIN_SINGULAR_RATIO = (
+    1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors
+)
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:

@@ -82,7 +82,9 @@ class RobotKnowledge:
             return
         wanted, shape = (1 + self.preview, self.spec.m), np.shape(reference)
         if shape != wanted:
-            raise ValueError(f"reference must have shape {wanted} for a preview of {self.preview}, got {shape}")
+            raise ValueError(
+                f"reference must have shape {wanted} for a preview of {self.preview}, got {shape}"
+            )
         if not is_finite(reference):
             raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")
 

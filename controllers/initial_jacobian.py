@@ -61,7 +61,11 @@ class InitialJacobian(ABC, Generic[State]):
 
     def step(self, state: State, observation: Observation) -> tuple[State, FloatArray, BoolArray]:
         """Return the new state, a velocity (..., n) [rad/s] of a probing move, and whether Ĵ₀ is known now, (...)."""
-        return state, np.zeros_like(observation.joint_position), np.full(observation.feature.shape[:-1], True)
+        return (
+            state,
+            np.zeros_like(observation.joint_position),
+            np.full(observation.feature.shape[:-1], True),
+        )
 
     @abstractmethod
     def jacobian(self, state: State) -> FloatArray:
@@ -85,7 +89,9 @@ class KnownJacobian(InitialJacobian[FloatArray]):
         """
         jacobian = np.array(self._model(observation.joint_position), dtype=np.float64, order="C")
         if jacobian.shape[-2:] != self._shape:
-            raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {jacobian.shape}")
+            raise ValueError(
+                f"nominal_jacobian must return shape {self._shape}, got {jacobian.shape}"
+            )
         return jacobian
 
     def jacobian(self, state: FloatArray) -> FloatArray:
@@ -123,7 +129,9 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         self._config = config
         self._spec = spec
         times = config.probe_time, config.settle_time, config.average_time
-        self._move, self._settle, self._rest = (ceil(in_periods(time, spec.period)) for time in times)
+        self._move, self._settle, self._rest = (
+            ceil(in_periods(time, spec.period)) for time in times
+        )
         self.duration = self._rest + spec.n * (self._move + self._settle + self._rest - 1)
         self._speed = config.probe_step / (self._move * spec.period)
         slowest = float(spec.joint_velocity_limit.min())
@@ -152,7 +160,9 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             rest_begins=np.zeros(lead, dtype=np.int_),
         )
 
-    def step(self, state: ProbeState, observation: Observation) -> tuple[ProbeState, FloatArray, BoolArray]:
+    def step(
+        self, state: ProbeState, observation: Observation
+    ) -> tuple[ProbeState, FloatArray, BoolArray]:
         """Return the velocity of the probing move, zero while resting or done, and whether all joints have moved."""
         config, n = self._config, self._spec.n
         rested = state.phase - state.rest_begins - self._settle
@@ -166,7 +176,11 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         last = pick(state.rest_positions, joint)
         room = ((last + config.probe_step <= self._spec.joint_upper) & chosen).any(axis=-1)
         speed = np.where(room, self._speed, -self._speed) * moves
-        return state._replace(phase=state.phase + 1), np.asarray(chosen * np.asarray(speed)[..., None]), done
+        return (
+            state._replace(phase=state.phase + 1),
+            np.asarray(chosen * np.asarray(speed)[..., None]),
+            done,
+        )
 
     def _gather(self, state: ProbeState, observation: Observation) -> ProbeState:
         return state._replace(
@@ -220,7 +234,9 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
     if config.source == "given":
         lengths = [len(row) for row in config.given]
         if lengths != [spec.n] * spec.m:
-            raise ValueError(f"initial.given must hold {spec.m} rows of {spec.n} entries, got rows of length {lengths}")
+            raise ValueError(
+                f"initial.given must hold {spec.m} rows of {spec.n} entries, got rows of length {lengths}"
+            )
         given = np.array(config.given)
         return KnownJacobian(lambda q: np.broadcast_to(given, (*q.shape[:-1], *given.shape)), spec)
     if model is None:

@@ -25,9 +25,19 @@ from typing import Any, Final, Generic, Self, TypeVar, final
 import numpy as np
 
 from servobench.controllers.aids import EQUIPPED, AidsConfig
-from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
+from servobench.controllers.controller import (
+    Controller,
+    ControllerEntry,
+    Diagnostics,
+    RobotKnowledge,
+)
 from servobench.controllers.estimators import correntropy
-from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.constant import (
+    ConstantConfig,
+    ConstantEstimator,
+    TrueConfig,
+    TrueEstimator,
+)
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
@@ -37,8 +47,17 @@ from servobench.controllers.estimators.kalman import (
     kalman_estimator,
     ukf_estimator,
 )
-from servobench.controllers.estimators.projection import BroydenConfig, CfdlConfig, ProjectionEstimator
-from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfLyapunovConfig, RbfLyapunovEstimator
+from servobench.controllers.estimators.projection import (
+    BroydenConfig,
+    CfdlConfig,
+    ProjectionEstimator,
+)
+from servobench.controllers.estimators.rbf import (
+    RbfConfig,
+    RbfEstimator,
+    RbfLyapunovConfig,
+    RbfLyapunovEstimator,
+)
 from servobench.controllers.estimators.robust_filter import RobustConfig, RobustEstimator
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Estimate, Law
@@ -122,7 +141,9 @@ class Method:
     summary: str  # one line for `servobench controllers`
     # settings of the law that differ from its own defaults
     law_defaults: Mapping[str, object] = field(default_factory=dict)
-    aids: Mapping[str, Any] = field(default_factory=dict)  # settings of the aids that differ from none
+    aids: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # settings of the aids that differ from none
     # settings of the law as published that differ from its own defaults; None: it is not published
     printed: Mapping[str, object] | None = None
     # settings of the estimator that differ from its own defaults where there are aids
@@ -135,7 +156,9 @@ class Method:
         if self.printed is None:
             return [self]
         summary = f"{self.summary}; as published, without aids"
-        printed = replace(self, law_defaults=self.printed, aids={}, estimator_defaults={}, network_defaults={})
+        printed = replace(
+            self, law_defaults=self.printed, aids={}, estimator_defaults={}, network_defaults={}
+        )
         return [self, replace(printed, name=self.name + PUBLISHED, summary=summary)]
 
     def config(self) -> MethodConfig:
@@ -152,7 +175,11 @@ class Method:
         """Return the controller for these settings and this robot; its parts see features in natural units."""
         law, estimator = self._parts()
         knowledge = in_natural_units(knowledge)
-        networks = [obtain_networks(config.training, knowledge)] if isinstance(config, TrainedMethodConfig) else []
+        networks = (
+            [obtain_networks(config.training, knowledge)]
+            if isinstance(config, TrainedMethodConfig)
+            else []
+        )
         servo = Servo(
             estimator.make(config.estimator, knowledge, *(networks if estimator.trained else ())),
             law.make(config.law, knowledge, *(networks if law.trained else ())),
@@ -169,21 +196,30 @@ class Method:
             ValueError: an unknown law or estimator.
         """
         needs_truth = any(part.needs_truth for part in self._parts())
-        return ControllerEntry(self.name, self.summary, self.config, self.build, needs_truth, side_by_side=True)
+        return ControllerEntry(
+            self.name, self.summary, self.config, self.build, needs_truth, side_by_side=True
+        )
 
     def _parts(self) -> tuple[Part[Any], Part[Any]]:
-        for kind, name, known in (("law", self.law, list(LAWS)), ("estimator", self.estimator, list(ESTIMATORS))):
+        for kind, name, known in (
+            ("law", self.law, list(LAWS)),
+            ("estimator", self.estimator, list(ESTIMATORS)),
+        ):
             if name not in known:
                 hint = did_you_mean(name, known)
-                raise ValueError(f"{kind} must be one of {', '.join(sorted(known))}, got {name!r}{hint}")
+                raise ValueError(
+                    f"{kind} must be one of {', '.join(sorted(known))}, got {name!r}{hint}"
+                )
         return LAWS[self.law], ESTIMATORS[self.estimator]
 
 
-_OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}  # which it brings itself
+# Which it brings itself
+_OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}
 _GIVEN = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
 _PRINTED_MPC = {"mode": "constant", "use_preview": False, "limit_position": False}
 
-_both = partial(Method, aids=EQUIPPED, printed={})  # methods best equipped, and as published with the law's defaults
+# Methods best equipped, and as published with the law's defaults
+_both = partial(Method, aids=EQUIPPED, printed={})
 
 _ROWS = (
     Method(
@@ -215,7 +251,9 @@ _ROWS = (
     _both("rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law"),
     _both("cfdl_mfac", "mfac", "cfdl", "compact-form model-free adaptive control of Hou and Jin"),
 )  # fmt: skip
-METHODS: Mapping[str, ControllerEntry] = {method.name: method.entry() for row in _ROWS for method in row.divisions()}
+METHODS: Mapping[str, ControllerEntry] = {
+    method.name: method.entry() for row in _ROWS for method in row.divisions()
+}
 
 
 @cache
@@ -250,9 +288,12 @@ def suggest_pair(name: str) -> str:
 class OwnLaw(Law[None]):
     """A controller `own` as the law of one run; it keeps its state itself. `seed` is for its next reset."""
 
-    def __init__(self, make: Callable[[RobotKnowledge], Controller], given: RobotKnowledge, aids: AidsConfig) -> None:
+    def __init__(
+        self, make: Callable[[RobotKnowledge], Controller], given: RobotKnowledge, aids: AidsConfig
+    ) -> None:
         """Make the controller with its knowledge of a robot, in the unit of the plant."""
-        self._nominal = None if aids.model == "own" else given.nominal_jacobian  # which is corrected
+        # Which is corrected
+        self._nominal = None if aids.model == "own" else given.nominal_jacobian
         self._unit, self.seed = given.spec.feature.scale, 0
         self._correction: FloatArray | float = 0.0
         self._rows = 1 if aids.feedforward else 1 + given.preview
@@ -271,7 +312,9 @@ class OwnLaw(Law[None]):
     ) -> tuple[None, FloatArray]:
         """Return the joint velocity of the controller, (n,) rad/s."""
         if self._nominal is not None:
-            self._correction = self._unit * estimate.jacobian - self._nominal(observation.joint_position)
+            self._correction = self._unit * estimate.jacobian - self._nominal(
+                observation.joint_position
+            )
         wanted = self._unit * reference[: self._rows]
         return state, self.own.step(self._in_plant_unit(observation), wanted).joint_velocity
 
@@ -291,11 +334,18 @@ class OwnLaw(Law[None]):
 class AidedController(Controller):
     """A controller of your own, `law.own`, in the chain of a composed one."""
 
-    def __init__(self, make: Callable[..., Controller], config: MethodConfig, knowledge: RobotKnowledge) -> None:
+    def __init__(
+        self, make: Callable[..., Controller], config: MethodConfig, knowledge: RobotKnowledge
+    ) -> None:
         """Make the controller, `make(config.law, knowledge)`, and compose the chain around it."""
-        self.law, natural = OwnLaw(partial(make, config.law), knowledge, config.aids), in_natural_units(knowledge)
+        self.law, natural = (
+            OwnLaw(partial(make, config.law), knowledge, config.aids),
+            in_natural_units(knowledge),
+        )
         initial = initial_jacobian(config.initial, natural)
-        self._chain = ServoController(Servo(ConstantEstimator(), self.law, initial, natural, config.aids))
+        self._chain = ServoController(
+            Servo(ConstantEstimator(), self.law, initial, natural, config.aids)
+        )
 
     def reset(self, observation: Observation, seed: int) -> None:
         """See `Controller.reset`."""

@@ -6,17 +6,31 @@ from typing import Any, Final, Literal, final
 
 import numpy as np
 
-from servobench.controllers.controller import Controller, ControllerEntry, Delays, Diagnostics, RobotKnowledge
+from servobench.controllers.controller import (
+    Controller,
+    ControllerEntry,
+    Delays,
+    Diagnostics,
+    RobotKnowledge,
+)
 from servobench.controllers.laws.mpc import closed_form
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver, joint_bounds
 from servobench.controllers.periods import check_preview, in_periods, sampled, whole_periods
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.settings import (
+    Count,
+    NonNegative,
+    Positive,
+    PositiveOrInfinite,
+    settings,
+)
 from servobench.plant.contract.signals import Command, Observation
 
 _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
-AGES: Final = 4  # exposures in a control period that are considered where frames are late by unknown times
+AGES: Final = (
+    4  # exposures in a control period that are considered where frames are late by unknown times
+)
 
 
 @settings
@@ -85,12 +99,16 @@ class NmpcCalibrated(Controller):
         knowledge = in_natural_units(knowledge)
         period = knowledge.spec.period
         blocks = closed_form.Blocks.of(config.horizon_time, config.moves, period)
-        self._taps = zero_vibration_taps(*knowledge.true_tool, period) if config.image else np.ones(1)
+        self._taps = (
+            zero_vibration_taps(*knowledge.true_tool, period) if config.image else np.ones(1)
+        )
         delay = config.delay + period * float(np.arange(len(self._taps)) @ self._taps)
         reach = blocks.count * blocks.length + delay
         check_preview(reach, knowledge.preview, period, "horizon_time + delay")
         if knowledge.true_symbolic is None:
-            raise ValueError("true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics")
+            raise ValueError(
+                "true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics"
+            )
         self._config, self._spec, self._knowledge = config, knowledge.spec, knowledge
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
@@ -104,7 +122,9 @@ class NmpcCalibrated(Controller):
         self._change: FloatArray = np.full(n, config.joint_acceleration_limit * blocks.length)
         limited = math.isfinite(config.joint_acceleration_limit)
         self._shape = QpShape(
-            weights=closed_form.move_weights(blocks.count, 1.0, config.terminal_weight / blocks.relative_length),
+            weights=closed_form.move_weights(
+                blocks.count, 1.0, config.terminal_weight / blocks.relative_length
+            ),
             move_weight=np.full(n, config.move_weight / blocks.relative_length**2),
             constant_gain=None,
             largest_move=self._spec.joint_velocity_limit * blocks.length,
@@ -114,7 +134,8 @@ class NmpcCalibrated(Controller):
             varying_jacobian=True,
         )
         self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
-        self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0  # of points, not of pixels
+        # of points, not of pixels
+        self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0
         self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
         self._forget()
 
@@ -155,9 +176,16 @@ class NmpcCalibrated(Controller):
             self._observe(observation, feature)
         start = present + self._to_come @ self._sent
         places: FloatArray = self._spec.period * np.arange(float(len(reference)))
-        rows = sampled(self._fixed(reference / self._knowledge.unit, observation.time + places), self._places)
+        rows = sampled(
+            self._fixed(reference / self._knowledge.unit, observation.time + places), self._places
+        )
         error = rows[0] - self._evaluate(start)[0] - self._b
-        wanted = rows[0] - error + closed_form.decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
+        wanted = (
+            rows[0]
+            - error
+            + closed_form.decay_targets(error, rows[1:] - rows[0], self._shares)
+            - self._b
+        )
         plan, limit = self._improve(start, wanted), self._spec.joint_velocity_limit
         velocity = np.clip(plan[0] / self._blocks.length, -limit, limit)
         passed = 1.0 / self._blocks.periods  # of the first block in this period
@@ -227,14 +255,22 @@ class NmpcCalibrated(Controller):
         self._note(solution, iterations, change, terminal_error)
         return plan
 
-    def _linearise(self, start: FloatArray, plan: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _linearise(
+        self, start: FloatArray, plan: FloatArray, wanted: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return J (H, m, n) along the plan and the targets (H, m) that J Σ dq should meet."""
         travel = np.cumsum(plan, axis=0)
         features, jacobians = self._along_plan((start + travel).T)
-        J = np.asarray(jacobians).reshape(self._spec.m, self._blocks.count, self._spec.n).swapaxes(0, 1)
+        J = (
+            np.asarray(jacobians)
+            .reshape(self._spec.m, self._blocks.count, self._spec.n)
+            .swapaxes(0, 1)
+        )
         return J, wanted - np.asarray(features).T + np.einsum("tij,tj->ti", J, travel)
 
-    def _note(self, solution: QpSolution, iterations: int, change: float, terminal_error: float) -> None:
+    def _note(
+        self, solution: QpSolution, iterations: int, change: float, terminal_error: float
+    ) -> None:
         self._diagnostics = {
             "solver_success": float(solution.success),
             "solver_iterations": float(iterations),
@@ -253,7 +289,11 @@ def exposure_ages(delays: Delays, period: float) -> FloatArray:
         period: of control [s].
     """
     youngest, spread = in_periods(delays.latency, period), in_periods(delays.latency_spread, period)
-    return np.array([youngest]) if spread == 0.0 else youngest + np.arange(0.0, spread + 1.0, 1.0 / AGES)
+    return (
+        np.array([youngest])
+        if spread == 0.0
+        else youngest + np.arange(0.0, spread + 1.0, 1.0 / AGES)
+    )
 
 
 def zero_vibration_taps(frequency: float, damping: float, period: float) -> FloatArray:
@@ -303,11 +343,15 @@ def _linearisation(symbolic: Any, n: int, m: int) -> Any:  # noqa: ANN401 - an e
     q = casadi.MX.sym("joint_position", n)
     feature = symbolic(q)
     if feature.shape != (m, 1):
-        raise ValueError(f"true_symbolic must give an expression of shape ({m}, 1), got {feature.shape}")
+        raise ValueError(
+            f"true_symbolic must give an expression of shape ({m}, 1), got {feature.shape}"
+        )
     function = create("linearisation", [q], [feature, casadi.jacobian(feature, q)])
     try:
         return function.expand()
-    except RuntimeError:  # foreign code, such as an FMU's, has no scalar operations; expanding only saves time
+    except (
+        RuntimeError
+    ):  # foreign code, such as an FMU's, has no scalar operations; expanding only saves time
         return function
 
 

@@ -4,7 +4,9 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 
-_WHOLE: float = 1e-9  # [1] relative distance to a whole number below which a number of periods is whole
+_WHOLE: float = (
+    1e-9  # [1] relative distance to a whole number below which a number of periods is whole
+)
 
 
 def in_periods(time: float, period: float) -> float:

@@ -75,13 +75,18 @@ class Servo:
         aids = aids or AidsConfig()
         predicts = aids.delay != "ignored" or aids.response != "ignored" or aids.filter
         if predicts and "predict" in law.owns:
-            raise ValueError(f"aids: {type(law).__name__} predicts by itself; leave delay, response and filter off")
+            raise ValueError(
+                f"aids: {type(law).__name__} predicts by itself; leave delay, response and filter off"
+            )
         delays = knowledge.true_delays or Delays(aids.latency, aids.command_delay, aids.lag)
         self.knowledge, self.law, self.initial = knowledge, law, initial
         self.estimation = Estimation(estimator, knowledge, aids, delays)
         self.predictor = Predictor(aids, knowledge.spec.period, delays) if predicts else None
         self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
-        self._feeds_forward, self._turns = aids.feedforward, law.in_model_frame and aids.model == "regression"
+        self._feeds_forward, self._turns = (
+            aids.feedforward,
+            law.in_model_frame and aids.model == "regression",
+        )
         self._rows = 1 + knowledge.preview if "preview" in law.owns else 1 + int(aids.feedforward)
         self._unit = knowledge.unit
 
@@ -93,7 +98,9 @@ class Servo:
         first = self.initial.jacobian(initial) if known else np.zeros((*lead, spec.m, spec.n))
         return self._begin(initial, np.full(lead, known)[()], observation, first)
 
-    def step(self, state: ServoState, observation: Observation, reference: FloatArray) -> tuple[ServoState, FloatArray]:
+    def step(
+        self, state: ServoState, observation: Observation, reference: FloatArray
+    ) -> tuple[ServoState, FloatArray]:
         """Return the new state and the joint velocity (..., n) [rad/s] for the period that begins now.
 
         Raises:
@@ -115,14 +122,29 @@ class Servo:
     def _natural(self, observation: Observation) -> Observation:
         return observation.with_values(observation.joint_position, observation.feature / self._unit)
 
-    def _probe(self, both: tuple[ServoState, FloatArray], observation: Observation) -> tuple[ServoState, FloatArray]:
+    def _probe(
+        self, both: tuple[ServoState, FloatArray], observation: Observation
+    ) -> tuple[ServoState, FloatArray]:
         initial, velocity, done = self.initial.step(both[0].initial, observation)
-        return branch(done, self._end_probing, both[0]._replace(initial=initial), observation), velocity
+        return branch(
+            done, self._end_probing, both[0]._replace(initial=initial), observation
+        ), velocity
 
     def _end_probing(self, state: ServoState, observation: Observation) -> ServoState:
-        return self._begin(state.initial, np.ones_like(state.ready), observation, self.initial.jacobian(state.initial))
+        return self._begin(
+            state.initial,
+            np.ones_like(state.ready),
+            observation,
+            self.initial.jacobian(state.initial),
+        )
 
-    def _begin(self, initial: Any, ready: BoolArray, observation: Observation, jacobian: FloatArray) -> ServoState:  # noqa: ANN401
+    def _begin(
+        self,
+        initial: Any,  # noqa: ANN401
+        ready: BoolArray,
+        observation: Observation,
+        jacobian: FloatArray,
+    ) -> ServoState:
         return ServoState(
             estimation=self.estimation.start(observation, jacobian),
             law=self.law.start(observation),
@@ -139,10 +161,14 @@ class Servo:
         estimation = self.estimation.update(state.estimation, observation, reference[..., 0, :])
         J = estimation.jacobian
         if not is_finite(J):
-            raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
+            raise ControllerDiverged(
+                f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}"
+            )
         predictor, ahead, later = state.predictor, observation, reference
         if self.predictor is not None:
-            predictor, ahead, lead, J = self.predictor.predict(predictor, self.estimation, estimation, observation)
+            predictor, ahead, lead, J = self.predictor.predict(
+                predictor, self.estimation, estimation, observation
+            )
             later = shifted(reference, lead, self._rows)
         forward = later[..., 1, :] - later[..., 0, :] if self._feeds_forward else np.zeros(())
         law, wanted = self._command(state, estimation, J, ahead, later)
@@ -159,7 +185,12 @@ class Servo:
         return ServoState(estimation, law, state.initial, predictor, state.ready, limited), u
 
     def _command(
-        self, state: ServoState, estimation: EstimationState, J: FloatArray, ahead: Observation, reference: FloatArray
+        self,
+        state: ServoState,
+        estimation: EstimationState,
+        J: FloatArray,
+        ahead: Observation,
+        reference: FloatArray,
     ) -> tuple[Any, FloatArray]:
         """Return the law's new state and its joint velocity, (..., n), rad/s.
 

@@ -45,8 +45,10 @@ html_title = "servobench"
 html_show_sourcelink = False
 copybutton_exclude = ".linenos, .gp, .go"
 
-ACCENT = re.compile(r"(\\(?:bar|dot|hat|tilde)\{[^{}]*\})_")  # docutils would set the index below the accented letter
-FENCE = re.compile("<mo[^>]*>([‖⟨⟩|])</mo>")  # which a browser would stretch to the height of the row
+# Docutils would set the index below the accented letter
+ACCENT = re.compile(r"(\\(?:bar|dot|hat|tilde)\{[^{}]*\})_")
+# Which a browser would stretch to the height of the row
+FENCE = re.compile("<mo[^>]*>([‖⟨⟩|])</mo>")
 SHORT = 24  # letters of code that is not broken
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+\.md)(?:#[^)\s]*)?\)")  # files beside the code
 
@@ -100,7 +102,9 @@ def inline_drawings(app: Sphinx, page: nodes.document, _name: str) -> None:
     for image in list(page.findall(nodes.image)):
         if image["uri"].endswith(".svg"):
             drawing = (Path(app.srcdir) / image["uri"]).read_text(encoding="utf-8")
-            image.replace_self(nodes.raw("", f'<div class="drawing">{drawing}</div>', format="html"))
+            image.replace_self(
+                nodes.raw("", f'<div class="drawing">{drawing}</div>', format="html")
+            )
 
 
 def keep_together(_app: Sphinx, page: nodes.document, _name: str) -> None:

@@ -119,7 +119,11 @@ def install_lines(extras: str) -> str:
     if RELEASED:
         lines.append(f"pip install 'servobench{brackets}'")
     else:
-        lines = ["git clone <this repository> servobench", *lines, f"pip install './servobench{brackets}'"]
+        lines = [
+            "git clone <this repository> servobench",
+            *lines,
+            f"pip install './servobench{brackets}'",
+        ]
     return "\n".join(f"    {line}" for line in lines)
 
 
@@ -133,17 +137,29 @@ def options_table() -> str:
     """Return the table of the options that several commands have with one meaning."""
     commands = command_line().commands
     owners: dict[tuple[str, str], list[str]] = {}
-    for name, each in [*commands.items(), *((f"fmu {name}", each) for name, each in commands["fmu"].commands.items())]:
+    for name, each in [
+        *commands.items(),
+        *((f"fmu {name}", each) for name, each in commands["fmu"].commands.items()),
+    ]:
         for option in each.params:
             if option.param_type_name == "option":
-                words = "`" + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip() + "`"
-                owners.setdefault((words, option.help.replace("\\[", "[").replace("<", "\\<")), []).append(name)
-    several = {words.removesuffix("S`") + "`" for words, _ in owners}  # the list of a name says the same
+                words = (
+                    "`"
+                    + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip()
+                    + "`"
+                )
+                owners.setdefault(
+                    (words, option.help.replace("\\[", "[").replace("<", "\\<")), []
+                ).append(name)
+    # The list of a name says the same
+    several = {words.removesuffix("S`") + "`" for words, _ in owners}
     meanings: dict[str, list[str]] = {}
     for (words, meaning), names in owners.items():
         if len(names) > 1 and words not in several:
             meanings.setdefault(words, []).append(meaning)
-    return table(("option", "meaning"), [(words, " Or: ".join(each)) for words, each in meanings.items()])
+    return table(
+        ("option", "meaning"), [(words, " Or: ".join(each)) for words, each in meanings.items()]
+    )
 
 
 def methods_table() -> str:
@@ -159,8 +175,12 @@ def methods_table() -> str:
             estimator, law = part_of(config.estimator, ESTIMATORS), part_of(config.law, LAWS)
             called = f"`{name}`" + (f", `{name}{PUBLISHED}`" if name + PUBLISHED in METHODS else "")
             networks = trained(ESTIMATORS[estimator], LAWS[law])
-            rows.append((called, f"`{estimator}`", f"`{law}`", aids_in_words(config.aids), networks, truth))
-    return table(("controller", "estimator", "law", "aids", "offline networks", "gets the truth"), rows)
+            rows.append(
+                (called, f"`{estimator}`", f"`{law}`", aids_in_words(config.aids), networks, truth)
+            )
+    return table(
+        ("controller", "estimator", "law", "aids", "offline networks", "gets the truth"), rows
+    )
 
 
 def presets_table() -> str:
@@ -169,7 +189,9 @@ def presets_table() -> str:
         (f"`{name}.{section}.{key}`", toml(value))
         for name in METHODS
         for section in ("estimator", "law", "initial", "training")
-        for key, value in differences(getattr(registry.find_controller(name).config(), section, None)).items()
+        for key, value in differences(
+            getattr(registry.find_controller(name).config(), section, None)
+        ).items()
     ]
     return table(("preset", "default"), rows)
 
@@ -223,7 +245,9 @@ def measured(part: re.Match[str], folder: Path) -> str:
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
     """Return the object that `place` names, such as `controllers/laws/mfac.py:MfacConfig`."""
     path, _, name = place.partition(":")
-    return getattr(importlib.import_module("servobench." + path.removesuffix(".py").replace("/", ".")), name)
+    return getattr(
+        importlib.import_module("servobench." + path.removesuffix(".py").replace("/", ".")), name
+    )
 
 
 def labelled(places: str) -> dict[str, type[Any]]:
@@ -240,9 +264,14 @@ def settings_table(kinds: dict[str, type[Any]]) -> str:
             owners.setdefault(row, []).append(f"`{label}`")
     if len(kinds) == 1:
         return table(SETTING, list(owners))
-    names = {row: "all" if len(found) == len(kinds) else ", ".join(found) for row, found in owners.items()}
+    names = {
+        row: "all" if len(found) == len(kinds) else ", ".join(found)
+        for row, found in owners.items()
+    }
     shared_first = sorted(owners, key=lambda row: -len(owners[row]))
-    return table((SETTING[0], "of", *SETTING[1:]), [(row[0], names[row], *row[1:]) for row in shared_first])
+    return table(
+        (SETTING[0], "of", *SETTING[1:]), [(row[0], names[row], *row[1:]) for row in shared_first]
+    )
 
 
 def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
@@ -258,7 +287,9 @@ def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
         if key and type(own) in classes_with_tables() and key not in differences(own):
             continue
         if not each.meaning:
-            raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
+            raise ValueError(
+                f"{kind.__name__}.{each.key} has no string below it that says its meaning"
+            )
         unit = f" [{each.unit}]" if each.unit else ""
         value = toml(each.value)
         choices = each.allowed.split(", ") if value in each.allowed.split(", ") else []
@@ -292,7 +323,9 @@ def attributes(kind: type[Any]) -> dict[str, str]:
         ValueError: a field has no entry below `Attributes:`.
     """
     text = inspect.getdoc(kind) or ""
-    entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text.partition("Attributes:\n")[2], re.MULTILINE)
+    entries = re.findall(
+        r"^    (\w+): (.*(?:\n {8}.*)*)", text.partition("Attributes:\n")[2], re.MULTILINE
+    )
     found = {name: " ".join(meaning.split()) for name, meaning in entries}
     missing = [each.name for each in dataclasses.fields(kind) if each.name not in found]
     if missing:
@@ -314,7 +347,11 @@ def interface(names: list[str]) -> str:
         text = node.body[0]
         lines = [*signature, *source.splitlines()[text.lineno - 1 : text.end_lineno]]
         if name.endswith("(*)"):
-            methods = (each for key, each in vars(thing).items() if inspect.isfunction(each) and key[0] != "_")
+            methods = (
+                each
+                for key, each in vars(thing).items()
+                if inspect.isfunction(each) and key[0] != "_"
+            )
             lines += [textwrap.indent(f"\n{in_brief(each)}", "    ") for each in methods]
         elif isinstance(thing, type):
             fields = (each for each in node.body if isinstance(each, ast.AnnAssign))
@@ -331,19 +368,36 @@ def definition(thing: Any) -> tuple[str, list[str], Any]:  # noqa: ANN401 - a fu
     source = textwrap.dedent(inspect.getsource(thing))
     node: Any = ast.parse(source).body[0]
     constants = vars(sys.modules[thing.__module__])
-    lines = (line.partition("  # ")[0] for line in source.splitlines()[node.lineno - 1 : node.body[0].lineno - 1])
-    return source, [re.sub(r"\b[A-Z]+_[A-Z_]+\b", lambda word: toml(constants[word[0]]), line) for line in lines], node
+    lines = (
+        line.partition("  # ")[0]
+        for line in source.splitlines()[node.lineno - 1 : node.body[0].lineno - 1]
+    )
+    return (
+        source,
+        [
+            re.sub(r"\b[A-Z]+_[A-Z_]+\b", lambda word: toml(constants[word[0]]), line)
+            for line in lines
+        ],
+        node,
+    )
 
 
 def in_brief(method: Any) -> str:  # noqa: ANN401 - a function
     """Return the signature of a method with the first line of its docstring."""
-    return "\n".join([*definition(method)[1], f'    """{inspect.getdoc(method).splitlines()[0]}"""'])
+    return "\n".join(
+        [*definition(method)[1], f'    """{inspect.getdoc(method).splitlines()[0]}"""']
+    )
 
 
 def metrics_table() -> str:
     """Return the table of the metrics of a run."""
     rows = [
-        (f"`{metric.column}`", metric.unit or "that of the feature", metric.better or "–", metric.meaning)
+        (
+            f"`{metric.column}`",
+            metric.unit or "that of the feature",
+            metric.better or "–",
+            metric.meaning,
+        )
         for metric in METRICS.values()
     ]
     return table(("column", "unit", "better", "definition"), rows)
@@ -352,7 +406,13 @@ def metrics_table() -> str:
 def variables_table() -> str:
     """Return the table of the variables of the exported FMU."""
     rows = [
-        (f"`{group.name}`", " × ".join(map(str, group.shape)), group.role, group.unit, group.description)
+        (
+            f"`{group.name}`",
+            " × ".join(map(str, group.shape)),
+            group.role,
+            group.unit,
+            group.description,
+        )
         for group in arm_layout(6).groups
     ]
     return table(("variable", "size", "role", "unit", "meaning"), rows)
@@ -360,7 +420,11 @@ def variables_table() -> str:
 
 def table(header: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     """Return a Markdown table."""
-    lines = [header, ("---",) * len(header), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    lines = [
+        header,
+        ("---",) * len(header),
+        *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows),
+    ]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

@@ -62,12 +62,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, list[str]]:
     """Return the options, and those that go to every command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("only", nargs="?", help="names of studies with commas between them; default: all")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "only", nargs="?", help="names of studies with commas between them; default: all"
+    )
     parser.add_argument("--runs", type=Path, help="folder of the runs; default results/pages")
-    parser.add_argument("--into", type=Path, help="folder that gets tables and pictures; default docs")
-    parser.add_argument("--robots", type=int, help="at most so many seeds a command; tables go beside the runs")
-    parser.add_argument("--check", action="store_true", help="compare with the stored tables instead of writing them")
+    parser.add_argument(
+        "--into", type=Path, help="folder that gets tables and pictures; default docs"
+    )
+    parser.add_argument(
+        "--robots", type=int, help="at most so many seeds a command; tables go beside the runs"
+    )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="compare with the stored tables instead of writing them",
+    )
     parser.add_argument("--keep", action="store_true", help="keep finished runs of other code")
     options, further = parser.parse_known_args(arguments)
     tried = options.robots is not None or bool(further)
@@ -76,7 +88,9 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, list[str
     return options, further
 
 
-def carry_out(study: Study, runs: Path, robots: int | None, further: Sequence[str], *, keep: bool) -> Path:
+def carry_out(
+    study: Study, runs: Path, robots: int | None, further: Sequence[str], *, keep: bool
+) -> Path:
     """Carry out what is missing of a study and return its folder.
 
     Raises:
@@ -112,7 +126,9 @@ def run(words: Sequence[str], out: Path) -> str:
     sys.stderr.write(f"{line} --out {out}\n")
     start = [str(ROOT / words[0])] if script else ["-m", "servobench", words[0]]
     going_on = ["--resume"] if out.exists() and not script else []
-    ended = subprocess.run([sys.executable, *start, *words[1:], "--out", str(out), *going_on], check=False)
+    ended = subprocess.run(
+        [sys.executable, *start, *words[1:], "--out", str(out), *going_on], check=False
+    )
     if ended.returncode:
         sys.exit(f"{out} ended with exit code {ended.returncode}; the same call goes on")
     return line
@@ -125,7 +141,9 @@ def fewer(command: Sequence[str], robots: int | None) -> list[str]:
         at = words.index("--seeds") + 1
         begin, colon, end = words[at].partition(":")
         count = max(robots, MIN_ROBOTS.get(words[0], 1))
-        words[at] = f"{begin}:{min(int(end), int(begin) + count)}" if colon else str(min(int(begin), count))
+        words[at] = (
+            f"{begin}:{min(int(end), int(begin) + count)}" if colon else str(min(int(begin), count))
+        )
     return words
 
 
@@ -156,7 +174,9 @@ def refuse_crashes(folder: Path) -> None:
 def store(study: Study, folder: Path, into: Path) -> None:
     """Write tables and files of a study."""
     for name, table in study.tables(folder).items():
-        stored_tables.write(into / "tables" / f"{name}.csv", stored_tables.Stored(stamp(study, folder), table))
+        stored_tables.write(
+            into / "tables" / f"{name}.csv", stored_tables.Stored(stamp(study, folder), table)
+        )
     for name, content in study.files(folder).items():
         path = into / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -165,10 +185,13 @@ def store(study: Study, folder: Path, into: Path) -> None:
 
 def stamp(study: Study, folder: Path) -> dict[str, str]:
     """Return how the runs of a study were made."""
-    commands = {part: (folder / f"{part}{DONE}").read_text(encoding="utf-8") for part in study.commands}
+    commands = {
+        part: (folder / f"{part}{DONE}").read_text(encoding="utf-8") for part in study.commands
+    }
     carried_out = [part for part, command in commands.items() if command]
     first = folder / carried_out[0]
-    parts = sorted(path.parent for path in first.glob(f"*/{results.MANIFEST}"))  # a suite's, one for each challenge
+    # A suite's, one for each challenge
+    parts = sorted(path.parent for path in first.glob(f"*/{results.MANIFEST}"))
     manifest = read_manifest(parts[0] if parts else first)
     return {
         "study": study.name,
@@ -185,7 +208,10 @@ def check(study: Study, folder: Path) -> list[str]:
     for name, table in study.tables(folder).items():
         path = stored_tables.FOLDER / f"{name}.csv"
         if path.exists():
-            lines += [f"{name}: {line}" for line in stored_tables.differences(table, stored_tables.read(path).table)]
+            lines += [
+                f"{name}: {line}"
+                for line in stored_tables.differences(table, stored_tables.read(path).table)
+            ]
         else:
             lines.append(f"{name}: not stored; call make results ONLY={study.name}")
     return lines

@@ -31,8 +31,14 @@ Output = dict[str, Any]
 
 def main() -> int:
     """Store the outputs, or return how many of the stored ones do not come out again."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare with the stored outputs instead of writing them")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="compare with the stored outputs instead of writing them",
+    )
     check = parser.parse_args().check
     notebook = json.loads(EXAMPLE.read_text(encoding="utf-8"))
     codes = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
@@ -67,9 +73,19 @@ def executed(codes: list[str]) -> list[list[Output]]:
             result = shell.run_cell(code)
         if not result.success:
             sys.exit(f"{code}\n{result.error_before_exec or result.error_in_exec!r}")
-        kept = [{kind: each.data[kind] for kind in SHOWN if kind in each.data} for each in captured.outputs]
-        printed = [{"output_type": "stream", "name": "stdout", "text": captured.stdout}] if captured.stdout else []
-        found.append(printed + [{"output_type": "display_data", "data": data, "metadata": {}} for data in kept])
+        kept = [
+            {kind: each.data[kind] for kind in SHOWN if kind in each.data}
+            for each in captured.outputs
+        ]
+        printed = (
+            [{"output_type": "stream", "name": "stdout", "text": captured.stdout}]
+            if captured.stdout
+            else []
+        )
+        found.append(
+            printed
+            + [{"output_type": "display_data", "data": data, "metadata": {}} for data in kept]
+        )
     return found
 
 

@@ -37,18 +37,26 @@ class Stored(NamedTuple):
 def write(path: Path, stored: Stored) -> None:
     """Write a table into a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    stamp = "".join(f"# {key}: {line}\n" for key, text in stored.stamp.items() for line in text.splitlines())
+    stamp = "".join(
+        f"# {key}: {line}\n" for key, text in stored.stamp.items() for line in text.splitlines()
+    )
     path.write_text(stamp + stored.table.to_csv(index=False), encoding="utf-8")
 
 
 def read(path: Path) -> Stored:
     """Return the table in a file."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    stamped = [line.removeprefix("# ").rstrip("\n").split(": ", 1) for line in lines if line.startswith("# ")]
+    stamped = [
+        line.removeprefix("# ").rstrip("\n").split(": ", 1)
+        for line in lines
+        if line.startswith("# ")
+    ]
     stamp: dict[str, str] = {}
     for key, text in stamped:
         stamp[key] = f"{stamp[key]}\n{text}" if key in stamp else text
-    table = pd.read_csv(io.StringIO("".join(lines[len(stamped) :])), dtype=str, keep_default_na=False)
+    table = pd.read_csv(
+        io.StringIO("".join(lines[len(stamped) :])), dtype=str, keep_default_na=False
+    )
     return Stored(stamp, table)
 
 

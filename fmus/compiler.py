@@ -62,11 +62,15 @@ def this_platform() -> Platform:
     Raises:
         ValueError: FMUs cannot be built for it.
     """
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
     system = {"win32": "windows"}.get(sys.platform, sys.platform)
     name = f"{machine}-{system}"
     if name not in PLATFORMS:
-        raise ValueError(f"this machine is {name!r}, for which no FMU can be built; known are {', '.join(PLATFORMS)}")
+        raise ValueError(
+            f"this machine is {name!r}, for which no FMU can be built; known are {', '.join(PLATFORMS)}"
+        )
     return PLATFORMS[name]
 
 
@@ -83,7 +87,9 @@ def parse_platforms(text: str | None) -> tuple[Platform, ...]:
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in PLATFORMS:
-            raise ValueError(f"platforms holds {name!r}; known are {', '.join(PLATFORMS)} and 'all'")
+            raise ValueError(
+                f"platforms holds {name!r}; known are {', '.join(PLATFORMS)} and 'all'"
+            )
     return tuple(PLATFORMS[name] for name in dict.fromkeys(names))
 
 
@@ -106,20 +112,34 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
     arguments = [*_compiler(target), *CODE, *target.flags, *sources, "-o", str(output), *libraries]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": "315532800", "ZERO_AR_DATE": "1"}
     done = subprocess.run(
-        arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False, errors="replace"
+        arguments,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        errors="replace",
     )
     if done.returncode != 0:
-        lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
-        raise CompilationFailed(f"{arguments[0]} failed for {target.name}: {lines[0] if lines else 'no message'}")
+        lines = [
+            line for line in done.stderr.splitlines() if "error" in line
+        ] or done.stderr.splitlines()
+        raise CompilationFailed(
+            f"{arguments[0]} failed for {target.name}: {lines[0] if lines else 'no message'}"
+        )
 
 
-def library_files(libraries: Mapping[Platform, bytes], identifier: str, fmi_version: int) -> dict[str, bytes]:
+def library_files(
+    libraries: Mapping[Platform, bytes], identifier: str, fmi_version: int
+) -> dict[str, bytes]:
     """Return libraries by their paths in an FMU.
 
     Importers of FMI 2 look on ARM in the folder of the 64-bit system, which has no word for the processor: for macOS it
     gets a library for both processors, for Linux that of ARM unless there is one of x86-64.
     """
-    files = {each.folder(fmi_version): (each.suffix, content) for each, content in libraries.items()}
+    files = {
+        each.folder(fmi_version): (each.suffix, content) for each, content in libraries.items()
+    }
     if fmi_version == 2:
         named = {each.name: content for each, content in libraries.items()}
         mac = [named[name] for name in ("x86_64-darwin", "aarch64-darwin") if name in named]
@@ -127,7 +147,10 @@ def library_files(libraries: Mapping[Platform, bytes], identifier: str, fmi_vers
             files["darwin64"] = (".dylib", universal_library(mac))
         if "aarch64-linux" in named:
             files.setdefault("linux64", (".so", named["aarch64-linux"]))
-    return {f"binaries/{folder}/{identifier}{suffix}": content for folder, (suffix, content) in files.items()}
+    return {
+        f"binaries/{folder}/{identifier}{suffix}": content
+        for folder, (suffix, content) in files.items()
+    }
 
 
 def universal_library(slices: Sequence[bytes]) -> bytes:
@@ -165,10 +188,16 @@ def _compiler(target: Platform) -> list[str]:
             if path is not None:
                 return [path, *flags]
         if named:
-            raise CompilerMissing(f"{target.name}: CC names {named!r}, which was not found; name another")
+            raise CompilerMissing(
+                f"{target.name}: CC names {named!r}, which was not found; name another"
+            )
     if importlib.util.find_spec("ziglang") is not None:
         return [sys.executable, "-m", "ziglang", "cc", "-target", target.zig_target]
-    wanted = "no C compiler was found" if target == this_platform() else "only zig compiles for another machine"
+    wanted = (
+        "no C compiler was found"
+        if target == this_platform()
+        else "only zig compiles for another machine"
+    )
     raise CompilerMissing(
         f"{target.name}: {wanted}; install gcc or clang (for this machine), or zig with pip install 'servobench[cross]'"
     )

@@ -33,11 +33,35 @@ def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]
     """
     return (
         Group(POSITION, (n,), INPUT, "rad", "Joint position as the encoders report it."),
-        Group(FEATURE, (m,), INPUT, unit, "Measured feature; where it is missing, the last valid value."),
+        Group(
+            FEATURE,
+            (m,),
+            INPUT,
+            unit,
+            "Measured feature; where it is missing, the last valid value.",
+        ),
         Group(SEEN, (m,), INPUT, "1", "1 where the feature was measured for this instant, else 0."),
-        Group(REFERENCE, (rows, m), INPUT, unit, "Desired feature now, in row 1, and at the next instants."),
-        Group(COMMAND, (n,), SAMPLED, "rad/s", "Joint velocity for the period that begins at this instant."),
-        Group(JACOBIAN, (m, n), SAMPLED, f"{unit}/rad", "Estimated Jacobian, 0 before there is one; for evaluation."),
+        Group(
+            REFERENCE,
+            (rows, m),
+            INPUT,
+            unit,
+            "Desired feature now, in row 1, and at the next instants.",
+        ),
+        Group(
+            COMMAND,
+            (n,),
+            SAMPLED,
+            "rad/s",
+            "Joint velocity for the period that begins at this instant.",
+        ),
+        Group(
+            JACOBIAN,
+            (m, n),
+            SAMPLED,
+            f"{unit}/rad",
+            "Estimated Jacobian, 0 before there is one; for evaluation.",
+        ),
     )
 
 
@@ -50,7 +74,9 @@ class ControllerModel:
     recorded: Recorded  # its step, of the columns [time, inputs]
     groups: tuple[Group, ...]  # from `controller_groups`
     period: float  # s
-    run: Mapping[str, FloatArray]  # of the original: time, inputs and the outputs for them by name, (k, size)
+    run: Mapping[
+        str, FloatArray
+    ]  # of the original: time, inputs and the outputs for them by name, (k, size)
     settings: str  # of the original, for the documentation
 
     @property
@@ -116,5 +142,7 @@ class ControllerModel:
 
     def _reference(self, layout: Layout) -> tuple[str, str]:
         """Return the run as CSV; the outputs at an instant, before its inputs, are those of the last one."""
-        before = {name: np.pad(self.run[name][:-1], ((1, 0), (0, 0))) for name in (COMMAND, JACOBIAN)}
+        before = {
+            name: np.pad(self.run[name][:-1], ((1, 0), (0, 0))) for name in (COMMAND, JACOBIAN)
+        }
         return tables({**self.run, **before}, layout)

@@ -51,8 +51,12 @@ class ExportOptions:
     # arm, cameras and home that become start values, and the step of default experiment and reference run
     setup: PlantSetup = field(default_factory=nominal_setup)
     config: KinematicConfig = field(default_factory=KinematicConfig)  # of lag, limits and mechanics
-    platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))  # platforms to compile for
-    mismatch: str = "none"  # text for the documentation that says how the model differs from the nominal one
+    platforms: tuple[Platform, ...] = field(
+        default_factory=lambda: (this_platform(),)
+    )  # platforms to compile for
+    mismatch: str = (
+        "none"  # text for the documentation that says how the model differs from the nominal one
+    )
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
@@ -91,14 +95,22 @@ class ExportOptions:
     def title(self) -> str:
         """Name of the model."""
         view = self.view
-        seen = "" if view is None else f", seen by {view.setup.name}{' on the hand' if view.mount == 'hand' else ''}"
+        seen = (
+            ""
+            if view is None
+            else f", seen by {view.setup.name}{' on the hand' if view.mount == 'hand' else ''}"
+        )
         return f"{self.robot.title} with mismatched kinematics{seen}"
 
     @property
     def summary(self) -> str:
         """The model in one sentence."""
         title, view = self.robot.title, self.view
-        seen = "with a ball on its flange under a fixed camera" if view is None else f"and its cameras: {view.setting}"
+        seen = (
+            "with a ball on its flange under a fixed camera"
+            if view is None
+            else f"and its cameras: {view.setting}"
+        )
         return (
             f"{'An' if title[:1] in set('AEIO') else 'A'} {title} {seen}; "
             "every length, angle and offset is a tunable parameter."
@@ -117,8 +129,20 @@ def fingerprint(options: ExportOptions) -> str:
     and their numbers, and of a set-up that is not one of `plant.cameras` its equations.
     """
     view = options.view
-    parts: list[object] = [exporter(), version("casadi"), version("fmpy"), CODE, options.platforms, options.fmi_version]
-    parts += [options.title, options.identifier, options.summary, None if view is None else view.size]
+    parts: list[object] = [
+        exporter(),
+        version("casadi"),
+        version("fmpy"),
+        CODE,
+        options.platforms,
+        options.fmi_version,
+    ]
+    parts += [
+        options.title,
+        options.identifier,
+        options.summary,
+        None if view is None else view.size,
+    ]
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]
     digest = hashlib.sha256(repr(parts).encode())
@@ -155,9 +179,13 @@ def product(options: ExportOptions) -> Product:
             title=options.title,
             summary=options.summary,
             joints=str(options.model.arm.n),
-            seen=f" and cameras: {view.setting}" if view else " carries a ball; a fixed camera sees it",
+            seen=f" and cameras: {view.setting}"
+            if view
+            else " carries a ball; a fixed camera sees it",
             feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
-            mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
+            mismatch="the nominal model"
+            if options.mismatch == "none"
+            else f"the mismatch “{options.mismatch}”",
         ),
         reference=tables(reference_run(options.setup, options.config), layout),
     )

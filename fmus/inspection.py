@@ -54,7 +54,9 @@ def read_information(path: Path) -> FmuInformation:
     root = extract_fmu(path)
     description, binaries = parse_description(path, root), root / "binaries"
     platforms = sorted(item.name for item in binaries.iterdir()) if binaries.is_dir() else ()
-    return FmuInformation(description, _interfaces(root), tuple(platforms), (root / "sources").is_dir())
+    return FmuInformation(
+        description, _interfaces(root), tuple(platforms), (root / "sources").is_dir()
+    )
 
 
 INTERFACES = {
@@ -82,7 +84,10 @@ def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
 def shape_of(variable: Any) -> tuple[int, ...]:  # noqa: ANN401 - fmpy's classes carry no usable types
     """Return the sizes of the axes of a variable, as they are at its start; an axis of unknown size is left out."""
     axes = variable.dimensions or ()
-    sizes = [each.start if each.start is not None else getattr(each.variable, "start", None) for each in axes]
+    sizes = [
+        each.start if each.start is not None else getattr(each.variable, "start", None)
+        for each in axes
+    ]
     return tuple(int(size) for size in sizes if size is not None)
 
 
@@ -91,8 +96,12 @@ class Validation:
     """Result of the checks."""
 
     problems: tuple[str, ...]  # one line for each; empty if there are none
-    departures: tuple[str, ...]  # from the standard, one line for each, with which it runs here nevertheless
-    deviation: float | None  # largest difference from the reference run, or None without a reference run
+    departures: tuple[
+        str, ...
+    ]  # from the standard, one line for each, with which it runs here nevertheless
+    deviation: (
+        float | None
+    )  # largest difference from the reference run, or None without a reference run
 
 
 def validate_fmu(path: Path) -> Validation:
@@ -114,9 +123,13 @@ def validate_fmu(path: Path) -> Validation:
             with closing(open_instance(description)) as instance:
                 instance.start(description.start_time)
     except (FmuError, ValueError) as error:
-        problems.append(f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}")
+        problems.append(
+            f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}"
+        )
     if deviation is not None and not deviation <= TOLERANCE:
-        problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
+        problems.append(
+            f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}"
+        )
     return Validation(tuple(problems), tuple(departures), deviation)
 
 
@@ -155,8 +168,14 @@ def _deviation(description: FmuDescription) -> float:
     root = description.root
     header_in, commands = read_table((root / INPUT_FILE).read_text(encoding="utf-8"))
     header_out, wanted = read_table((root / OUTPUT_FILE).read_text(encoding="utf-8"))
-    inputs, outputs = Port(_variables(description, header_in)), Port(_variables(description, header_out))
-    if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (len(commands), outputs.values.size + 1):
+    inputs, outputs = (
+        Port(_variables(description, header_in)),
+        Port(_variables(description, header_out)),
+    )
+    if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (
+        len(commands),
+        outputs.values.size + 1,
+    ):
         raise ValueError("the reference tables do not fit the FMU's variables")
     with closing(open_instance(description)) as instance:
         write, read = instance.writer(inputs), instance.reader(outputs)
@@ -178,4 +197,8 @@ def _variables(description: FmuDescription, header: list[str]) -> list[Variable]
     """Return the variables of the columns; in FMI 3 the columns `name[1]`, … belong to one array variable."""
     known = {variable.name for variable in description.variables}
     names = [name if name in known else name.partition("[")[0] for name in header[1:]]
-    return [variable for name in dict.fromkeys(names) for variable in description.find(name, "reference run")]
+    return [
+        variable
+        for name in dict.fromkeys(names)
+        for variable in description.find(name, "reference run")
+    ]

@@ -55,7 +55,8 @@ LOG_CATEGORIES = {
 REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard for the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
 
-_Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]  # unknown, its dependencies, elementwise or as a whole
+# Unknown, its dependencies, elementwise or as a whole
+_Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,11 @@ class Section:
                 dependencies: list[int] = []
                 for name in names:
                     first = self.layout.offsets[name]
-                    dependencies += [first + k] if elementwise else range(first, first + self.layout.by_name[name].size)
+                    dependencies += (
+                        [first + k]
+                        if elementwise
+                        else range(first, first + self.layout.by_name[name].size)
+                    )
                 yield self.layout.offsets[unknown] + k, sorted(dependencies)
 
     def arrays(self) -> Iterable[tuple[int, list[int]]]:
@@ -88,7 +93,9 @@ class Section:
 
 def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
     """Return outputs, derivatives, initial unknowns and event indicators of an arm with their dependencies."""
-    geometry, computed = ([group.name for group in part] for part in (layout.kinematic, layout.computed))
+    geometry, computed = (
+        [group.name for group in part] for part in (layout.kinematic, layout.computed)
+    )
     state = ("joint_position", "joint_velocity")
     tool = ("tool_deflection", "tool_velocity")
     outputs: _Rows = [(name, (name,), True) for name in (*state, *tool)]
@@ -112,7 +119,12 @@ def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
         Section("Outputs", "Output", layout, outputs),
         Section("Derivatives", "ContinuousStateDerivative", layout, derivatives),
         Section("InitialUnknowns", "InitialUnknown", layout, start),
-        Section("", "EventIndicator", layout, [("stop_indicator", (*state[:1], "joint_velocity_command"), False)]),
+        Section(
+            "",
+            "EventIndicator",
+            layout,
+            [("stop_indicator", (*state[:1], "joint_velocity_command"), False)],
+        ),
     )
 
 
@@ -120,7 +132,10 @@ def sampled_sections(layout: Layout) -> tuple[Section, ...]:
     """Return outputs and initial unknowns of a system in discrete time: every output depends on every input."""
     inputs = tuple(group.name for group in layout.of_role(INPUT))
     rows: _Rows = [(group.name, inputs, False) for group in layout.of_role(SAMPLED)]
-    return (Section("Outputs", "Output", layout, rows), Section("InitialUnknowns", "InitialUnknown", layout, rows))
+    return (
+        Section("Outputs", "Output", layout, rows),
+        Section("InitialUnknowns", "InitialUnknown", layout, rows),
+    )
 
 
 @dataclass(frozen=True)
@@ -132,7 +147,9 @@ class Description:
     summary: str  # one sentence
     layout: Layout  # the variables
     sections: tuple[Section, ...]  # of the model structure
-    start: Mapping[str, FloatArray]  # start values of parameters and inputs, flat arrays by group; else zero
+    start: Mapping[
+        str, FloatArray
+    ]  # start values of parameters and inputs, flat arrays by group; else zero
     sources: tuple[str, ...]  # C files to compile, in order
     step: float  # of the default experiment [s]
     exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation
@@ -163,14 +180,23 @@ def write_description(description: Description, version: int, token: str) -> byt
     categories = ET.SubElement(root, "LogCategories")
     for name, text in LOG_CATEGORIES.items():
         ET.SubElement(categories, "Category", name=name, description=text)
-    experiment = {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(description.step)}
+    experiment = {
+        "startTime": "0",
+        "stopTime": "10",
+        "tolerance": "1e-6",
+        "stepSize": repr(description.step),
+    }
     ET.SubElement(root, "DefaultExperiment", experiment)
     _variables(ET.SubElement(root, "ModelVariables"), description, version)
     structure = ET.SubElement(root, "ModelStructure")
     for section in description.sections:
         if version == 3:
             for reference, dependencies in section.arrays():
-                ET.SubElement(structure, section.fmi3, {"valueReference": str(reference)} | _dependent(dependencies))
+                ET.SubElement(
+                    structure,
+                    section.fmi3,
+                    {"valueReference": str(reference)} | _dependent(dependencies),
+                )
         elif section.fmi2:
             element = ET.SubElement(structure, section.fmi2)
             for index, dependencies in section.scalars():
@@ -181,7 +207,10 @@ def write_description(description: Description, version: int, token: str) -> byt
 
 def _interfaces(root: ET.Element, description: Description, version: int) -> None:
     """Add model exchange, if there is one, and co-simulation with their capabilities."""
-    derivatives, state = str(description.exchange).lower(), "FMUstate" if version == 2 else "FMUState"
+    derivatives, state = (
+        str(description.exchange).lower(),
+        "FMUstate" if version == 2 else "FMUState",
+    )
     capabilities = {"modelIdentifier": description.model_identifier}
     if version == 2:
         capabilities["canNotUseMemoryManagementFunctions"] = "true"
@@ -189,7 +218,9 @@ def _interfaces(root: ET.Element, description: Description, version: int) -> Non
     if version == 2:
         capabilities["providesDirectionalDerivative"] = derivatives
     else:
-        capabilities |= dict.fromkeys(("providesDirectionalDerivatives", "providesAdjointDerivatives"), derivatives)
+        capabilities |= dict.fromkeys(
+            ("providesDirectionalDerivatives", "providesAdjointDerivatives"), derivatives
+        )
     interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
     if description.exchange:
         own = {"completedIntegratorStepNotNeeded": "false"} if version == 2 else {}
@@ -205,11 +236,19 @@ def _interfaces(root: ET.Element, description: Description, version: int) -> Non
 def write_build_description(description: Description) -> bytes:
     """Return sources/buildDescription.xml of FMI 3.0."""
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
-    configuration = ET.SubElement(root, "BuildConfiguration", modelIdentifier=description.model_identifier)
+    configuration = ET.SubElement(
+        root, "BuildConfiguration", modelIdentifier=description.model_identifier
+    )
     files = ET.SubElement(configuration, "SourceFileSet", language="C11")
     for name in description.sources:
         ET.SubElement(files, "SourceFile", name=name)
-    ET.SubElement(configuration, "Library", name="m", external="true", description="C's mathematical functions")
+    ET.SubElement(
+        configuration,
+        "Library",
+        name="m",
+        external="true",
+        description="C's mathematical functions",
+    )
     return xml_bytes(root)
 
 
@@ -236,7 +275,9 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
 def _units(root: ET.Element, used: set[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     # A pixel, or any other unit of a set-up, is a number.
-    own = {name: {"rad": "-1"} if name.endswith("/rad") else {} for name in sorted(used - set(UNITS))}
+    own = {
+        name: {"rad": "-1"} if name.endswith("/rad") else {} for name in sorted(used - set(UNITS))
+    }
     for name, exponents in (UNITS | own).items():
         unit = ET.SubElement(definitions, "Unit", name=name)
         ET.SubElement(unit, "BaseUnit", exponents)
@@ -249,12 +290,20 @@ def _variables(parent: ET.Element, description: Description, version: int) -> No
     layout = description.layout
     for group in layout.groups:
         first, values = layout.offsets[group.name], description.start.get(group.name)
-        starts = ["0.0"] * group.size if values is None else [repr(float(value)) for value in values]
+        starts = (
+            ["0.0"] * group.size if values is None else [repr(float(value)) for value in values]
+        )
         for k, name in enumerate(group.scalar_names() if version == 2 else [group.name]):
             attributes = {"name": name, "valueReference": str(first + k), **ATTRIBUTES[group.role]}
             attributes["description"] = group.description
-            bounds = {"displayUnit": DISPLAY_UNITS.get(group.unit), "min": group.minimum, "nominal": group.nominal}
-            real = {"unit": group.unit} | {name: str(bound) for name, bound in bounds.items() if bound is not None}
+            bounds = {
+                "displayUnit": DISPLAY_UNITS.get(group.unit),
+                "min": group.minimum,
+                "nominal": group.nominal,
+            }
+            real = {"unit": group.unit} | {
+                name: str(bound) for name, bound in bounds.items() if bound is not None
+            }
             if group.role in (PARAMETER, FIXED, INPUT):
                 real["start"] = starts[k] if version == 2 else " ".join(starts)
             if group.role == DERIVATIVE:
@@ -267,8 +316,15 @@ def _variables(parent: ET.Element, description: Description, version: int) -> No
                 for size in group.shape:
                     ET.SubElement(variable, "Dimension", start=str(size))
     if version == 3:
-        time = {"causality": "independent", "variability": "continuous", "unit": "s", "description": "Simulation time."}
-        ET.SubElement(parent, "Float64", {"name": "time", "valueReference": str(layout.size)} | time)
+        time = {
+            "causality": "independent",
+            "variability": "continuous",
+            "unit": "s",
+            "description": "Simulation time.",
+        }
+        ET.SubElement(
+            parent, "Float64", {"name": "time", "valueReference": str(layout.size)} | time
+        )
 
 
 def _dependent(dependencies: list[int]) -> dict[str, str]:

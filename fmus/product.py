@@ -37,8 +37,16 @@ HEADERS: Final = {
 ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 PLACEHOLDER: Final = "{token}"
 RELATED_FILES: Final = (
-    (INPUT_FILE, "testcase", "Inputs of the reference run, each held over the step that begins at its time."),
-    (OUTPUT_FILE, "result", "Outputs of the reference run, computed by an independent implementation."),
+    (
+        INPUT_FILE,
+        "testcase",
+        "Inputs of the reference run, each held over the step that begins at its time.",
+    ),
+    (
+        OUTPUT_FILE,
+        "result",
+        "Outputs of the reference run, computed by an independent implementation.",
+    ),
 )
 
 
@@ -58,17 +66,32 @@ class Product:
     def sources(self) -> dict[str, str]:
         """Return the C files by their path in the archive, with a placeholder for the token."""
         described, version_ = self.description, self.fmi_version
-        machinery = ("model_functions.h", "instance.h", "instance.c", "shared_functions.h", f"fmi{version_}.c")
+        machinery = (
+            "model_functions.h",
+            "instance.h",
+            "instance.c",
+            "shared_functions.h",
+            f"fmi{version_}.c",
+        )
         texts = {name: committed(MACHINERY, name) for name in machinery}
-        texts |= {name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")}
-        texts |= {name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8") for name in HEADERS[version_]}
+        texts |= {
+            name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")
+        }
+        texts |= {
+            name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8")
+            for name in HEADERS[version_]
+        }
         texts[f"{self.core}.c"] = self.source
-        texts["layout.h"] = layout_header(described.layout, described.start, self.constants, PLACEHOLDER)
+        texts["layout.h"] = layout_header(
+            described.layout, described.start, self.constants, PLACEHOLDER
+        )
         return {f"sources/{name}": text for name, text in texts.items()}
 
     def descriptions(self, token: str) -> dict[str, bytes]:
         """Return the XML files by their path in the archive."""
-        files = {"modelDescription.xml": write_description(self.description, self.fmi_version, token)}
+        files = {
+            "modelDescription.xml": write_description(self.description, self.fmi_version, token)
+        }
         if self.fmi_version == 3:
             files["sources/buildDescription.xml"] = write_build_description(self.description)
         return files
@@ -76,7 +99,9 @@ class Product:
     def companions(self) -> dict[str, str]:
         """Return documentation, licence and reference run by their path in the archive."""
         inputs, outputs = self.reference
-        related = ((f"../{file.removeprefix('extra/')}", role, text) for file, role, text in RELATED_FILES)
+        related = (
+            (f"../{file.removeprefix('extra/')}", role, text) for file, role, text in RELATED_FILES
+        )
         return {
             INPUT_FILE: inputs,
             OUTPUT_FILE: outputs,
@@ -99,7 +124,9 @@ class Product:
             CompilerMissing: no compiler for one of the platforms.
             CompilationFailed: a compiler rejected the sources.
         """
-        contents = {name: text.encode() for name, text in (self.sources() | self.companions()).items()}
+        contents = {
+            name: text.encode() for name, text in (self.sources() | self.companions()).items()
+        }
         token = _token(contents)
         layout_name = "sources/layout.h"
         contents[layout_name] = contents[layout_name].replace(PLACEHOLDER.encode(), token.encode())
@@ -108,7 +135,9 @@ class Product:
         write_archive(path, contents)
         return path
 
-    def _libraries(self, contents: Mapping[str, bytes], platforms: tuple[Platform, ...]) -> dict[str, bytes]:
+    def _libraries(
+        self, contents: Mapping[str, bytes], platforms: tuple[Platform, ...]
+    ) -> dict[str, bytes]:
         identifier = self.description.model_identifier
         with tempfile.TemporaryDirectory(prefix="servobench-export-") as name:
             folder = Path(name)
@@ -151,7 +180,9 @@ def documentation(folder: str, layout: Layout, **words: str) -> str:
         for group in layout.groups
     ]
     escaped = {name: html.escape(text) for name, text in words.items()}
-    return string.Template(committed(folder, "documentation.html")).substitute(escaped, rows="\n".join(rows))
+    return string.Template(committed(folder, "documentation.html")).substitute(
+        escaped, rows="\n".join(rows)
+    )
 
 
 def word(text: str, otherwise: str) -> str:
@@ -168,7 +199,9 @@ def _token(contents: Mapping[str, bytes]) -> str:
     return f"{{{UUID(digest.hexdigest()[:32])}}}"
 
 
-def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "modelDescription.xml") -> None:
+def write_archive(
+    path: Path, contents: Mapping[str, bytes], first: str = "modelDescription.xml"
+) -> None:
     """Write files by their path in a zip archive, the `first` one first; atomically.
 
     Raises:

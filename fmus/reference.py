@@ -27,7 +27,11 @@ def tables(run: Mapping[str, FloatArray], layout: Layout) -> tuple[str, str]:
         layout: of the variables.
     """
     others = {name: rows for name, rows in run.items() if name != "time"}
-    inputs = {name: others.pop(name) for name in run if name in others and layout.by_name[name].role == INPUT}
+    inputs = {
+        name: others.pop(name)
+        for name in run
+        if name in others and layout.by_name[name].role == INPUT
+    }
     return table(run["time"], inputs, layout), table(run["time"], others, layout)
 
 
@@ -35,7 +39,9 @@ def reference_run(setup: PlantSetup, config: KinematicConfig) -> dict[str, Float
     """Return the reference run of the kinematic plant; some of its commands exceed the speed limit."""
     world = KinematicWorld(config, setup)
     limit = world.spec.command.upper
-    wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, world.spec.n))
+    wanted = named_generator(0, "fmu_reference").uniform(
+        -1.2 * limit, 1.2 * limit, (STEPS + 1, world.spec.n)
+    )
     rows = []
     for command in np.clip(wanted, -limit, limit):
         state, feature, visible = world.save(), world.see(), world.visible()
@@ -45,7 +51,11 @@ def reference_run(setup: PlantSetup, config: KinematicConfig) -> dict[str, Float
     measured = FEATURE if isinstance(setup.model, SetupModel) else BALL
     names = ("joint_position", "joint_velocity", measured, SEEN, "encoder_position")
     outputs = dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
-    return {"time": np.arange(STEPS + 1, dtype=np.float64) * setup.period, COMMAND: wanted, **outputs}
+    return {
+        "time": np.arange(STEPS + 1, dtype=np.float64) * setup.period,
+        COMMAND: wanted,
+        **outputs,
+    }
 
 
 def read_table(text: str) -> tuple[list[str], FloatArray]:
@@ -67,6 +77,8 @@ def table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -
     """Return values by name, (k, size), as CSV with one column for each scalar."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["time", *(scalar for name in columns for scalar in layout.by_name[name].scalar_names())])
+    writer.writerow(
+        ["time", *(scalar for name in columns for scalar in layout.by_name[name].scalar_names())]
+    )
     writer.writerows(np.column_stack([time, *columns.values()]).tolist())
     return text.getvalue()

@@ -61,7 +61,9 @@ def generated_source(name: str, functions: Iterable[Any]) -> str:
         return HEAD.format(name=name) + (Path(folder) / f"{name}.c").read_text(encoding="utf-8")
 
 
-def layout_header(layout: Layout, start: Mapping[str, FloatArray], constants: Mapping[str, float], token: str) -> str:
+def layout_header(
+    layout: Layout, start: Mapping[str, FloatArray], constants: Mapping[str, float], token: str
+) -> str:
     """Return the C header with sizes, offsets, start values and minima.
 
     Args:
@@ -72,7 +74,9 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], constants: Ma
     """
     settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
     zero = np.zeros(1)
-    values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
+    values = np.concatenate(
+        [np.resize(start.get(group.name, zero), group.size) for group in layout.groups]
+    )
     least = [group.minimum for group in settable for _ in range(group.size)]
     minima = ["-HUGE_VAL" if each is None else each.hex() for each in least]
     macros = {
@@ -80,9 +84,14 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], constants: Ma
         "N_GROUPS": len(layout.groups),
         "N_VALUES": layout.size,
         "N_SETTABLE": sum(group.size for group in settable),
-        **{f"OFFSET_{name.upper().translate(IN_MACROS)}": offset for name, offset in layout.offsets.items()},
+        **{
+            f"OFFSET_{name.upper().translate(IN_MACROS)}": offset
+            for name, offset in layout.offsets.items()
+        },
         **constants,
-        "GROUPS": _initialiser(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups),
+        "GROUPS": _initialiser(
+            f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups
+        ),
         "START_VALUES": _initialiser(float(value).hex() for value in values),
         "MINIMA": _initialiser(minima),
     }
@@ -152,11 +161,20 @@ def _equations(layout: ArmLayout, s: SX, p: SX, c: SX) -> tuple[SX, SX, SX, SX]:
     pushed = casadi.if_else(speed > 0.0, c <= -part["backlash"], c >= part["backlash"])
     carried = casadi.jtimes(place, q, v * pushed)
     omega, slip = part["tool_frequency"], w - carried
-    rates = casadi.vertcat(slip, -(omega**2) * deflection - 2.0 * part["tool_damping"] * omega * slip)
-    return feature, jacobian, casadi.vertcat(place, carried), casadi.if_else(omega > 0.0, rates, 0.0)
+    rates = casadi.vertcat(
+        slip, -(omega**2) * deflection - 2.0 * part["tool_damping"] * omega * slip
+    )
+    return (
+        feature,
+        jacobian,
+        casadi.vertcat(place, carried),
+        casadi.if_else(omega > 0.0, rates, 0.0),
+    )
 
 
-def _ball(q: SX, part: Mapping[str, SX], arm: ArmGeometry, slope: SX, deflection: SX) -> tuple[SX, SX, SX]:
+def _ball(
+    q: SX, part: Mapping[str, SX], arm: ArmGeometry, slope: SX, deflection: SX
+) -> tuple[SX, SX, SX]:
     """Return the ball in the camera frame, always seen; ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i)) × slope; and p_B."""
     R_BC = symbolic_rotation(part["camera_rpy"])
     axes, origins, rotation, position = arm_frames(q, arm)
@@ -166,7 +184,11 @@ def _ball(q: SX, part: Mapping[str, SX], arm: ArmGeometry, slope: SX, deflection
         for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
     ]
     feature = R_BC.T @ (ball + deflection - part["camera_position"])
-    return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), R_BC.T @ casadi.horzcat(*columns), ball
+    return (
+        casadi.vertcat(feature, casadi.SX.ones(feature.numel())),
+        R_BC.T @ casadi.horzcat(*columns),
+        ball,
+    )
 
 
 def _arm(part: Mapping[str, SX]) -> ArmGeometry:
@@ -189,8 +211,12 @@ def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry
         view.size,
         _objects(part["calibration"], (c, view.calibration)) if view.calibration else None,
     )
-    positions, angles = (casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy"))
-    poses = [(symbolic_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]
+    positions, angles = (
+        casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy")
+    )
+    poses = [
+        (symbolic_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)
+    ]
     return SetupGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
 
 

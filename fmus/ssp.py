@@ -18,7 +18,9 @@ STRUCTURE: Final = "SystemStructure.ssd"
 PLANT, CONTROLLER = "plant", "controller"
 
 
-def write_loop(path: Path, plant: Product, controller: Product, platforms: tuple[Platform, ...], stop: float) -> Path:
+def write_loop(
+    path: Path, plant: Product, controller: Product, platforms: tuple[Platform, ...], stop: float
+) -> Path:
     """Write the closed loop of two products of FMI 2.
 
     Args:
@@ -69,9 +71,16 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
                 ET.SubElement(connector, f"{{{SSC}}}Real", unit=group.unit)
     connections = ET.SubElement(system, f"{{{SSD}}}Connections")
     for (start, first), (end, second) in wires:
-        pairs = zip(groups[start][first].scalar_names(), groups[end][second].scalar_names(), strict=True)
+        pairs = zip(
+            groups[start][first].scalar_names(), groups[end][second].scalar_names(), strict=True
+        )
         for one, other in pairs:
-            names = {"startElement": start, "startConnector": one, "endElement": end, "endConnector": other}
+            names = {
+                "startElement": start,
+                "startConnector": one,
+                "endElement": end,
+                "endConnector": other,
+            }
             ET.SubElement(connections, f"{{{SSD}}}Connection", names)
     _units(root, {group.unit for _, group in ends})
     ET.SubElement(root, f"{{{SSD}}}DefaultExperiment", startTime="0", stopTime=repr(stop))

@@ -32,7 +32,9 @@ class Ur5FmuConfig(ArmConfig):
 
 
 @cache
-def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | None = None) -> Path:
+def cached_fmu(
+    fmi_version: int, robot: Robot | None = None, sensing: Sensing | None = None
+) -> Path:
     """Return a nominal robot, by default the UR5, as FMU, from the user's cache folder.
 
     It is built there if anything in it has changed.
@@ -65,7 +67,10 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
     resolution, mechanics = config.encoder_resolution, config.mechanics
     mechanics.check(model)
     own = KinematicConfig(config.max_joint_speed, config.joint_range, mechanics=mechanics)
-    parameters = parameters_of(setup, own) | {"lag": np.resize(lag, n), "encoder_resolution": np.full(n, resolution)}
+    parameters = parameters_of(setup, own) | {
+        "lag": np.resize(lag, n),
+        "encoder_resolution": np.full(n, resolution),
+    }
     del parameters["home"]
     stops = (parameters[name] for name in ("max_speed", "joint_lower", "joint_upper"))
     return FmuMapping(
@@ -76,7 +81,9 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         seen=() if view is None else (SEEN,),
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
-        camera=("camera_position", "camera_rpy") if view is None or view.setup.cameras == 1 else None,
+        camera=("camera_position", "camera_rpy")
+        if view is None or view.setup.cameras == 1
+        else None,
         parameters=parameters,
         limits=JointLimits(*stops),
         names=LogNames(model.arm.joint_names, model.channel.names, model.channel.unit),
@@ -97,7 +104,9 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
     with configuration_errors("the FMU cannot be built: "):
         path = cached_fmu(config.fmi_version, setup.nominal, sensing)
     lag = float(np.mean(config.joint_lags or config.lag))
-    bench = build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model)
+    bench = build_fmu(
+        ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model
+    )
     bench.world.mechanics = config.mechanics
     return bench
 

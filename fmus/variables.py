@@ -84,7 +84,9 @@ class View(NamedTuple):
     @property
     def setting(self) -> str:
         """Features and place of the cameras, for descriptions."""
-        return f"{self.setup.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
+        return (
+            f"{self.setup.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
+        )
 
     def parameters(self) -> tuple[Group, ...]:
         """Return the kinematic parameters of target and cameras, in order."""
@@ -93,7 +95,10 @@ class View(NamedTuple):
         middle = "Principal point, from the upper left corner of the image."
         turned = f"Roll, pitch and yaw of the cameras in the {on} frame."
         further = "f_y/f_x, k2, p1, p2, k3 of OpenCV's model, and the largest squared tangent of a visible ray"
-        last = {COLUMNS["rational_polynomial"]: ", and k4, k5, k6", COLUMNS["equidistant"]: ", and k4 of a fisheye"}
+        last = {
+            COLUMNS["rational_polynomial"]: ", and k4, k5, k6",
+            COLUMNS["equidistant"]: ", and k4 of a fisheye",
+        }
         further += last.get(self.calibration, "") + "."
         return (
             Group("target", (p, 3), PARAMETER, "m", f"Points of the target in the {off} frame."),
@@ -102,7 +107,11 @@ class View(NamedTuple):
             Group("focal_length", (c,), PARAMETER, "px", "Focal length of each camera."),
             Group("principal_point", (c, 2), PARAMETER, "px", middle),
             Group("distortion", (c,), PARAMETER, "1", "First coefficient of radial distortion."),
-            *([Group("calibration", (c, self.calibration), PARAMETER, "1", further)] if self.calibration else []),
+            *(
+                [Group("calibration", (c, self.calibration), PARAMETER, "1", further)]
+                if self.calibration
+                else []
+            ),
         )
 
     def outputs(self, n: int) -> tuple[Group, ...]:
@@ -111,7 +120,9 @@ class View(NamedTuple):
         visible = "1 where a camera sees the feature, with nothing in between; 0 elsewhere."
         slope = "Derivative of feature by joint_position; for evaluation."
         return (
-            Group(FEATURE, (m,), OUTPUT, unit, f"Measured features: {', '.join(self.setup.features)}."),
+            Group(
+                FEATURE, (m,), OUTPUT, unit, f"Measured features: {', '.join(self.setup.features)}."
+            ),
             Group(SEEN, (m,), OUTPUT, "1", visible),
             Group("jacobian", (m, n), OUTPUT, f"{unit}/rad", slope),
         )
@@ -129,40 +140,112 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
     table = "transform after joint i"
     return (
         Group("base_position", (3,), PARAMETER, "m", "Axis of joint 1 in the base frame."),
-        Group("base_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of joint 1 in the base frame."),
+        Group(
+            "base_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of joint 1 in the base frame."
+        ),
         Group("a", (n,), PARAMETER, "m", f"DH link length: x of the {table}."),
         Group("y", (n,), PARAMETER, "m", f"Calibration column, 0 in DH: y of the {table}."),
         Group("d", (n,), PARAMETER, "m", f"DH link offset: z of the {table}."),
         Group("alpha", (n,), PARAMETER, "rad", f"DH link twist: roll of the {table}."),
-        Group("pitch", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: pitch of the {table}."),
+        Group(
+            "pitch", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: pitch of the {table}."
+        ),
         Group("yaw", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: yaw of the {table}."),
-        Group("joint_offset", (n,), PARAMETER, "rad", "True joint angle at a reported position of zero."),
+        Group(
+            "joint_offset",
+            (n,),
+            PARAMETER,
+            "rad",
+            "True joint angle at a reported position of zero.",
+        ),
         Group("gear_ratio", (n,), PARAMETER, "1", "True joint motion over reported joint motion."),
         *(BALL_PARAMETERS if view is None else view.parameters()),
         Group("backlash", (n,), PARAMETER, "rad", "Half of the play between gear and joint.", 0.0),
         Group("ripple", (n,), PARAMETER, "rad", "Amplitude by which the gear leads the joint."),
         Group("ripple_order", (n,), PARAMETER, "1", "Periods of the ripple in a turn."),
         Group(
-            "tool_frequency", (1,), PARAMETER, "rad/s", "Natural frequency of a flexible tool; 0 for a rigid one.", 0.0
+            "tool_frequency",
+            (1,),
+            PARAMETER,
+            "rad/s",
+            "Natural frequency of a flexible tool; 0 for a rigid one.",
+            0.0,
         ),
-        Group("tool_damping", (1,), PARAMETER, "1", "Damping ratio of a flexible tool, below 1.", 0.0),
-        Group("lag", (n,), PARAMETER, "s", "Time constant of the joint's velocity loop; 0 for none.", 0.0),
-        Group("max_speed", (n,), PARAMETER, "rad/s", "Commands beyond it, either way, are clipped.", 0.0),
+        Group(
+            "tool_damping", (1,), PARAMETER, "1", "Damping ratio of a flexible tool, below 1.", 0.0
+        ),
+        Group(
+            "lag",
+            (n,),
+            PARAMETER,
+            "s",
+            "Time constant of the joint's velocity loop; 0 for none.",
+            0.0,
+        ),
+        Group(
+            "max_speed",
+            (n,),
+            PARAMETER,
+            "rad/s",
+            "Commands beyond it, either way, are clipped.",
+            0.0,
+        ),
         Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
         Group("joint_upper", (n,), PARAMETER, "rad", "The joint stops here."),
-        Group("encoder_resolution", (n,), PARAMETER, "rad", "Step of the encoder; 0 for an exact one.", 0.0),
-        Group("home", (n,), FIXED, "rad", "Reported joint position at the start, within the stops."),
-        Group("joint_velocity_command", (n,), INPUT, "rad/s", "Joint velocity command, held over a step."),
+        Group(
+            "encoder_resolution",
+            (n,),
+            PARAMETER,
+            "rad",
+            "Step of the encoder; 0 for an exact one.",
+            0.0,
+        ),
+        Group(
+            "home", (n,), FIXED, "rad", "Reported joint position at the start, within the stops."
+        ),
+        Group(
+            "joint_velocity_command",
+            (n,),
+            INPUT,
+            "rad/s",
+            "Joint velocity command, held over a step.",
+        ),
         Group("joint_position", (n,), STATE, "rad", "Reported joint position.", nominal=1.0),
         Group("joint_velocity", (n,), STATE, "rad/s", "Reported joint velocity.", nominal=1.0),
-        Group("tool_deflection", (3,), STATE, "m", "Deflection of the tool in the base frame.", nominal=1.0),
-        Group("tool_velocity", (3,), STATE, "m/s", "Velocity of the target in the base frame.", nominal=1.0),
-        Group("der(joint_position)", (n,), DERIVATIVE, "rad/s", "Derivative of the joint position."),
-        Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
+        Group(
+            "tool_deflection",
+            (3,),
+            STATE,
+            "m",
+            "Deflection of the tool in the base frame.",
+            nominal=1.0,
+        ),
+        Group(
+            "tool_velocity",
+            (3,),
+            STATE,
+            "m/s",
+            "Velocity of the target in the base frame.",
+            nominal=1.0,
+        ),
+        Group(
+            "der(joint_position)", (n,), DERIVATIVE, "rad/s", "Derivative of the joint position."
+        ),
+        Group(
+            "der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."
+        ),
         Group("der(tool_deflection)", (3,), DERIVATIVE, "m/s", "Derivative of the deflection."),
         Group("der(tool_velocity)", (3,), DERIVATIVE, "m/s2", "Derivative of the velocity."),
-        Group("stop_indicator", (n, 2), INDICATOR, "1", "Distance to lower and upper stop; at a stop the command."),
-        Group("encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."),
+        Group(
+            "stop_indicator",
+            (n, 2),
+            INDICATOR,
+            "1",
+            "Distance to lower and upper stop; at a stop the command.",
+        ),
+        Group(
+            "encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."
+        ),
         *(_ball_outputs(n) if view is None else view.outputs(n)),
     )
 
@@ -170,7 +253,9 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
 BALL_PARAMETERS: Final = (
     Group("tool", (3,), PARAMETER, "m", "Ball centre in the flange frame."),
     Group("camera_position", (3,), PARAMETER, "m", "Camera in the base frame."),
-    Group("camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."),
+    Group(
+        "camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."
+    ),
 )
 
 
@@ -179,7 +264,13 @@ def _ball_outputs(n: int) -> tuple[Group, ...]:
     return (
         Group(BALL, (3,), OUTPUT, "m", "Ball centre in the camera frame."),
         Group(SEEN, (3,), OUTPUT, "1", "1: the camera sees the ball wherever it is."),
-        Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),
+        Group(
+            "jacobian",
+            (3, n),
+            OUTPUT,
+            "m/rad",
+            "Derivative of ball_position by joint_position; for evaluation.",
+        ),
     )
 
 
@@ -242,8 +333,14 @@ def parameters_of(setup: PlantSetup, config: KinematicConfig) -> dict[str, Float
         "joint_offset": arm.joint_offset,
         "gear_ratio": arm.gear_ratio,
         **_sensing_parameters(model),
-        **{name: np.full(n, getattr(mechanics, name)) for name in ("backlash", "ripple", "ripple_order")},
-        **{name: np.array([getattr(mechanics, name)]) for name in ("tool_frequency", "tool_damping")},
+        **{
+            name: np.full(n, getattr(mechanics, name))
+            for name in ("backlash", "ripple", "ripple_order")
+        },
+        **{
+            name: np.array([getattr(mechanics, name)])
+            for name in ("tool_frequency", "tool_damping")
+        },
         "lag": np.full(n, config.lag),
         "max_speed": stops.speed,
         "joint_lower": stops.lower,

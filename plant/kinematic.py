@@ -23,7 +23,15 @@ from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Delay, JointSpeed, Positive, ShareBelowOne, Usual, nested, settings
+from servobench.plant.contract.settings import (
+    Delay,
+    JointSpeed,
+    Positive,
+    ShareBelowOne,
+    Usual,
+    nested,
+    settings,
+)
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
 from servobench.plant.robot.mechanics import MechanicsConfig, Motion, Tool
@@ -78,7 +86,10 @@ def discretise_lag(lag: float, period: float) -> tuple[FloatArray, FloatArray]:
 
 
 def follow_with_overshoot(
-    joints: tuple[FloatArray, FloatArray, FloatArray], u: FloatArray, config: KinematicConfig, period: float
+    joints: tuple[FloatArray, FloatArray, FloatArray],
+    u: FloatArray,
+    config: KinematicConfig,
+    period: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return q, v and v̇ after a period of v̈ = ω² (u − v) − 2ζω v̇ with a held command, in closed form.
 
@@ -123,10 +134,15 @@ class KinematicWorld(World):
         """
         model, start = setup.robot()
         mechanics = self.mechanics = config.mechanics
-        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
+        self.spec = hand_eye_spec(
+            model, setup.period, config.max_joint_speed, config.joint_range, setup.limits
+        )
         rest, none = np.zeros(start.shape), np.zeros((*model.lead, 3))
         x = mechanics.transmitted(start) if mechanics.geared else start
-        self.lead, self._first = model.lead, KinematicState(model, start, rest, rest, x, Tool(none, none))
+        self.lead, self._first = (
+            model.lead,
+            KinematicState(model, start, rest, rest, x, Tool(none, none)),
+        )
         self._model, self._q, self._v, self._a, self._x, self._tool = self._first
         self._flexible, self._parts = mechanics.tool_frequency > 0.0, mechanics.parts(setup.period)
         self._part = setup.period / self._parts
@@ -167,7 +183,9 @@ class KinematicWorld(World):
         v = kept * self._v + to_v * joint_velocity
         a, swings = self._a, self._config.overshoot > 0.0
         if swings:
-            q, v, a = follow_with_overshoot((self._q, self._v, a), joint_velocity, self._config, self._part)
+            q, v, a = follow_with_overshoot(
+                (self._q, self._v, a), joint_velocity, self._config, self._part
+            )
         if not is_finite(q):
             q, v = self._rest(q, v)
         self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
@@ -189,7 +207,9 @@ class KinematicWorld(World):
         if self._truth is None:
             feature, jacobian, self._seen = self._model.observe(self._x)
             if self._flexible:
-                feature = feature + np.vecmat(self._tool.deflection, self._model.camera[..., :3, :3])
+                feature = feature + np.vecmat(
+                    self._tool.deflection, self._model.camera[..., :3, :3]
+                )
             if self.mechanics.ripple > 0.0:
                 jacobian = jacobian * self.mechanics.slope(self._q)[..., None, :]
             self._truth = Truth(feature, jacobian)

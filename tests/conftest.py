@@ -8,7 +8,9 @@ import sys
 import tempfile
 from functools import cache
 
-os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by numpy's import: threads of several processes wait for each other
+os.environ["OPENBLAS_NUM_THREADS"] = (
+    "1"  # read by numpy's import: threads of several processes wait for each other
+)
 
 import numpy as np
 import pytest
@@ -35,7 +37,8 @@ def pytest_configure(config: pytest.Config) -> None:
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
     if shutil.which("cc") and "SERVOBENCH_NIGHTLY" not in os.environ:
-        os.environ.setdefault("CC", """sh -c 'cc "$@" -O0' cc""")  # optimising an FMU takes longer than to run it
+        # Optimising an FMU takes longer than to run it
+        os.environ.setdefault("CC", """sh -c 'cc "$@" -O0' cc""")
 
 
 @pytest.hookimpl(tryfirst=True)

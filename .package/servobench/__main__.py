@@ -6,7 +6,8 @@ import os
 
 def main() -> None:
     """Run the command, which is imported late: a worker process imports this module before it can end with it."""
-    gc.set_threshold(50_000)  # imports make lasting objects only: the collector would visit them again and again
+    # Imports make lasting objects only: the collector would visit them again and again
+    gc.set_threshold(50_000)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from servobench.harness.cli.main import main as command
 

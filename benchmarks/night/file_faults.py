@@ -48,7 +48,11 @@ from servobench.plant.fmu.archive import extract_fmu
 SOURCE = Path(__file__).with_name("file_faults.c")
 MODES = {"KILL": 1, "TORN": 2, "POWER": 3, "EIO": 4, "ENOSPC": 5}
 SENSING = {"drop_probability": 0.05}
-SETTINGS = {"random": {"duration": 0.2}, "run": {"lost_after": 0.05}, "kinematic": {"sensing": SENSING}}
+SETTINGS = {
+    "random": {"duration": 0.2},
+    "run": {"lost_after": 0.05},
+    "kinematic": {"sensing": SENSING},
+}
 
 
 def build(folder: Path) -> Path:
@@ -68,9 +72,13 @@ def start(folder: Path, *arguments: str, timeout: float | None = None) -> dict[s
         "LD_PRELOAD": str(library),
         "BREAK_LIBRARY": str(library),
         "BREAK_BELOW": str(folder / "point"),
-        "PYTHONPATH": os.pathsep.join(str(PACKAGE.parent / name) for name in (".package", "tests", "benchmarks")),
+        "PYTHONPATH": os.pathsep.join(
+            str(PACKAGE.parent / name) for name in (".package", "tests", "benchmarks")
+        ),
     }
-    done = carried_out(sys.executable, "-m", "night.file_faults", *arguments, env=environment, timeout=timeout)
+    done = carried_out(
+        sys.executable, "-m", "night.file_faults", *arguments, env=environment, timeout=timeout
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     figures = dict(json.loads(done.stdout.splitlines()[-1]))
     return figures | ({"why": done.stderr[-3000:]} if figures["failed"] else {})
@@ -80,8 +88,13 @@ def start_each(modes: list[str], arguments: list[str]) -> dict[str, object]:
     """Break in each way in a process of its own, as many at a time as there are processors; return all figures."""
     begin = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(lambda mode: start(Path(folder, mode), *arguments, "--modes", mode), modes))
-    added = {name: sum((each[name] for each in found[1:]), found[0][name]) for name in ("points", "failed")}
+        found = list(
+            pool.map(lambda mode: start(Path(folder, mode), *arguments, "--modes", mode), modes)
+        )
+    added = {
+        name: sum((each[name] for each in found[1:]), found[0][name])
+        for name in ("points", "failed")
+    }
     why = "\n".join(str(each["why"]) for each in found if each["failed"])
     minutes = round((time.monotonic() - begin) / 60.0, 2)
     return {**found[0], **added, "minutes": minutes, **({"why": why} if why else {})}
@@ -89,7 +102,9 @@ def start_each(modes: list[str], arguments: list[str]) -> dict[str, object]:
 
 def campaign(steps: bool, controllers: tuple[str, ...], runs: int) -> Campaign:
     """Return a batch of short runs, some of which lose the feature."""
-    batch = Batch(("kinematic",), controllers, ("random",), ("moderate",), range(runs // len(controllers)))
+    batch = Batch(
+        ("kinematic",), controllers, ("random",), ("moderate",), range(runs // len(controllers))
+    )
     return Campaign(SweepPlan(batch).cells(), Settings(SETTINGS), steps)
 
 
@@ -103,16 +118,29 @@ class Batches:
     def carry_out(self, point: Path, *, resume: bool = False) -> None:
         """Do it, or what is left of it."""
         bounds = Bounds(isolate=False)
-        carry_out(self.batch, point, Execution(workers=1, block=self.block, resume=resume, bounds=bounds))
+        carry_out(
+            self.batch, point, Execution(workers=1, block=self.block, resume=resume, bounds=bounds)
+        )
 
     def outcome(self, point: Path) -> list[object]:
         """Return the tables; raise AssertionError where the folder is not as it should be."""
         found = examine(point)
         assert not found.findings, found.findings
-        left = {path.name for path in point.iterdir()} - {results.STEPS, results.RUNS, results.FAILURES, NETWORKS}
+        left = {path.name for path in point.iterdir()} - {
+            results.STEPS,
+            results.RUNS,
+            results.FAILURES,
+            NETWORKS,
+        }
         assert left == {results.MANIFEST, "SHA256SUMS"}, left
-        tables = [results.load_runs(point), *([results.load_steps(point)] if self.batch.steps else [])]
-        return [(list(table.columns), pd.util.hash_pandas_object(table).tolist()) for table in map(judged, tables)]
+        tables = [
+            results.load_runs(point),
+            *([results.load_steps(point)] if self.batch.steps else []),
+        ]
+        return [
+            (list(table.columns), pd.util.hash_pandas_object(table).tolist())
+            for table in map(judged, tables)
+        ]
 
     def look(self, point: Path) -> None:
         """Read what an interrupted attempt has left."""
@@ -136,15 +164,29 @@ class Caches:
         if not archive_path.exists():
             archive_path.write_bytes(packed(2, zipfile.ZIP_DEFLATED))
         extract_fmu(archive_path)
-        NetworkSource(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(TRAINING)
+        NetworkSource(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(
+            TRAINING
+        )
 
     def outcome(self, point: Path) -> dict[str, bytes]:
-        entries = [entry for kind in ("extracted", NETWORKS) for entry in cache.cache_folder(kind).iterdir()]
-        whole = [entry for entry in entries if not entry.name.startswith((".lock", cache.UNFINISHED))]
+        entries = [
+            entry
+            for kind in ("extracted", NETWORKS)
+            for entry in cache.cache_folder(kind).iterdir()
+        ]
+        whole = [
+            entry for entry in entries if not entry.name.startswith((".lock", cache.UNFINISHED))
+        ]
         assert len(whole) == 2, entries
         assert all(map(cache.is_whole, whole))
-        files = [path for entry in whole for path in (entry / cache.FILES).rglob("*") if path.is_file()]
-        return {str(path.relative_to(point)): path.read_bytes() for path in files if path.suffix != ".npz"}
+        files = [
+            path for entry in whole for path in (entry / cache.FILES).rglob("*") if path.is_file()
+        ]
+        return {
+            str(path.relative_to(point)): path.read_bytes()
+            for path in files
+            if path.suffix != ".npz"
+        }
 
     def look(self, point: Path) -> None:
         """Nothing but the next use reads a cache."""
@@ -222,7 +264,10 @@ def main() -> None:
         runs=50,
         controllers="constant,broyden",
         block=(16, "runs that advance together at most"),
-        caches={"action": "store_true", "help": "break caches of an FMU and of networks, and no batch"},
+        caches={
+            "action": "store_true",
+            "help": "break caches of an FMU and of networks, and no batch",
+        },
         steps={"action": "store_true", "help": "keep the table of steps, as compare does"},
         every=(1, "break each so many-th operation only"),
         modes=",".join(MODES),
@@ -232,11 +277,15 @@ def main() -> None:
         print(json.dumps(figures, indent=1))
         sys.exit(bool(figures["failed"]))
     folder = Path(os.environ["BREAK_LIBRARY"]).parent
-    batch = Batches(campaign(chosen.steps, tuple(chosen.controllers.split(",")), chosen.runs), chosen.block)
+    batch = Batches(
+        campaign(chosen.steps, tuple(chosen.controllers.split(",")), chosen.runs), chosen.block
+    )
     breaker = Breaker(folder, Caches() if chosen.caches else batch)
     total = breaker.operations()
     for mode in chosen.modes.split(","):
-        for number in range(1 + 7 * list(MODES).index(mode) % chosen.every, total + 1, chosen.every):
+        for number in range(
+            1 + 7 * list(MODES).index(mode) % chosen.every, total + 1, chosen.every
+        ):
             breaker.break_at(number, mode)
     print(json.dumps({"operations": total, "points": breaker.points, "failed": breaker.failed}))
 

@@ -58,7 +58,9 @@ def drawn(parser: Parser, source: random.Random) -> str | bytes:
         return (b"" if raw else "").join(piece() for _ in range(source.randrange(7)))
     number, text = source.randint(1, 4), source.choice(parser.examples)
     for _ in range(number):
-        text = _change(text, source.choice(CHANGES), source.random(), source.choice(LENGTHS), piece())
+        text = _change(
+            text, source.choice(CHANGES), source.random(), source.choice(LENGTHS), piece()
+        )
     return text
 
 
@@ -151,11 +153,16 @@ def limited() -> Iterator[None]:
 def main() -> int:
     """Carry the campaign out."""
     inputs, first = (1_000_000, "number of inputs over all parsers"), (0, "seed of the first batch")
-    chosen = options(__doc__, inputs=inputs, first=first, only=("", "comma-separated names of parsers"))
+    chosen = options(
+        __doc__, inputs=inputs, first=first, only=("", "comma-separated names of parsers")
+    )
     names = chosen.only.split(",") if chosen.only else list(PARSERS)
     shares = sum(PARSERS[name].share for name in names)
     found, total, begin = 0, 0, time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="servobench-fuzz-") as scratch, np.errstate(all="ignore"):
+    with (
+        tempfile.TemporaryDirectory(prefix="servobench-fuzz-") as scratch,
+        np.errstate(all="ignore"),
+    ):
         os.environ["XDG_CACHE_HOME"] = scratch
         for name in names:
             wanted = max(1, round(chosen.inputs * PARSERS[name].share / shares))
@@ -163,12 +170,13 @@ def main() -> int:
             total += tried.counts.total()
             found += len(tried.breaks)
             taken, refused = tried.counts[True], tried.counts[False]
-            line = (
-                f"{name}: {taken} taken, {refused} refused, {len(tried.breaks)} broken, longest {tried.longest:.2f} s"
-            )
+            counts = f"{taken} taken, {refused} refused, {len(tried.breaks)} broken"
+            line = f"{name}: {counts}, longest {tried.longest:.2f} s"
             print(line, *tried.breaks.values(), sep="\n    ", flush=True)
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    print(f"{total} inputs, {found} broken, {time.monotonic() - begin:.0f} s, at most {largest:.0f} MB in memory")
+    print(
+        f"{total} inputs, {found} broken, {time.monotonic() - begin:.0f} s, at most {largest:.0f} MB in memory"
+    )
     return min(found, 1)
 
 
@@ -176,7 +184,9 @@ def main() -> int:
 class Tried:
     """Counts of the inputs of a parser, and its broken promises."""
 
-    counts: Counter[bool] = field(default_factory=Counter)  # how many it took (True) and refused (False)
+    counts: Counter[bool] = field(
+        default_factory=Counter
+    )  # how many it took (True) and refused (False)
     breaks: dict[str, str] = field(default_factory=dict)  # what broke its promise, each kind once
     longest: float = 0.0  # [s] of the processor
 

@@ -156,9 +156,8 @@ class LeavesChildren(Quiet):
 
     def strike(self):
         if self.time < 0.3:
-            sleep = (
-                "import os, time; os.fork() and os._exit(0); os.setsid(); os.fork() and os._exit(0); time.sleep(300)"
-            )
+            leave = "os.fork() and os._exit(0)"
+            sleep = f"import os, time; {leave}; os.setsid(); {leave}; time.sleep(300)"
             subprocess.run([sys.executable, "-S", "-c", sleep], check=True)
 
 

@@ -28,10 +28,14 @@ from night.kills import SOON, Sweep
 from servobench.plant.contract.seeds import named_seed
 
 HOSTILE: Final = Path(hostile_controllers.__file__)
-CONTROLLERS: Final = (*(f"{HOSTILE}:{name}" for name in ("Falsifies", "Sometimes", "Quiet")), "constant")
+CONTROLLERS: Final = (
+    *(f"{HOSTILE}:{name}" for name in ("Falsifies", "Sometimes", "Quiet")),
+    "constant",
+)
 FIRST_SEED: Final = 100_000
 SMALL_FILE: Final = 4000  # [bytes] less than a part of the results: a disk that is full
-HARMLESS: Final = ("Forks", "InterruptsItself", "LeavesChildren", "Prints")  # runs that complete all the same
+# Runs that complete all the same
+HARMLESS: Final = ("Forks", "InterruptsItself", "LeavesChildren", "Prints")
 KILLED_AT: Final = (0.25, 0.6)  # share of the runs
 
 
@@ -99,18 +103,26 @@ def judge(quiet: pd.DataFrame, hard: pd.DataFrame, runs: int) -> pd.DataFrame:
     """Hold the two tables against each other; return how many runs ended how, by what was done to them."""
     if len(hard) != runs or list(hard["run_id"]) != list(quiet["run_id"]):
         sys.exit(f"{len(hard)} rows instead of {runs}, or other ones")
-    harm = pd.Series([_harm(*each) for each in zip(hard["controller"], hard["seed"], strict=True)], name="harm")
+    harm = pd.Series(
+        [_harm(*each) for each in zip(hard["controller"], hard["seed"], strict=True)], name="harm"
+    )
     spared = harm.isin(["", *HARMLESS])
     pd.testing.assert_frame_equal(hard[spared], quiet[spared], check_exact=True)
     if (hard[~spared]["status"] == "completed").any():
-        sys.exit(f"runs to which harm was done completed:\n{hard[~spared & (hard['status'] == 'completed')]}")
+        sys.exit(
+            f"runs to which harm was done completed:\n{hard[~spared & (hard['status'] == 'completed')]}"
+        )
     return hard.groupby([harm, "status"]).size().rename("runs").reset_index()
 
 
 def _harm(controller: str, seed: int) -> str:
     if controller == "Falsifies":
         return "Lies"
-    found = hostile_controllers.harm_of(named_seed(seed, "controller")) if controller == "Sometimes" else None
+    found = (
+        hostile_controllers.harm_of(named_seed(seed, "controller"))
+        if controller == "Sometimes"
+        else None
+    )
     return "" if found is None else found.__name__
 
 
@@ -133,7 +145,9 @@ def main() -> None:
         quiet, hard = Sweep(folder / "quiet", *how, PEACE="1"), Sweep(folder / "hard", *how)
         calm, took, lived = carry_out(quiet, hard, runs)
         print(judge(quiet.table(), hard.table(), runs).to_string(index=False))
-        print(f"{runs} rows; all runs that nothing was done to equal those of the quiet sweep bit for bit")
+        print(
+            f"{runs} rows; all runs that nothing was done to equal those of the quiet sweep bit for bit"
+        )
         print(f"quiet {calm:.0f} s, hard {took:.0f} s: {took / calm:.1f} times as long")
         print(f"after each kill of the parent everything was gone within {max(lived):.2f} s")
 

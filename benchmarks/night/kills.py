@@ -36,7 +36,9 @@ MARK: Final = "SERVOBENCH_KILLS"  # an environment variable that everything star
 SOON: Final = 5.0  # [s] until nothing is left of a command that has ended
 LONG: Final = 15.0  # [s] until what is left then is ended here
 PATIENCE: Final = 600.0  # [s] for a call to end by itself
-LATEST: Final = 4.0  # [s] from the start of a victim, or the last signal, to the next one at the latest
+LATEST: Final = (
+    4.0  # [s] from the start of a victim, or the last signal, to the next one at the latest
+)
 BATCHES: Final = (f"{hostile_controllers.__file__}:Quiet,constant", "constant,calibrated")
 
 
@@ -45,7 +47,9 @@ class Outcome:
     """What came of the signals."""
 
     signals: Counter[tuple[str, str]] = field(default_factory=Counter)  # by victim and signal
-    lived: dict[tuple[str, str], float] = field(default_factory=dict)  # [s] after the end of the command, the longest
+    lived: dict[tuple[str, str], float] = field(
+        default_factory=dict
+    )  # [s] after the end of the command, the longest
     tables: int = 0
     faults: list[str] = field(default_factory=list)
 
@@ -53,14 +57,36 @@ class Outcome:
 class Sweep:
     """A sweep that is ended by force and goes on."""
 
-    def __init__(self, folder: Path, controllers: str, seeds: str, *further: str, **environment: str) -> None:
+    def __init__(
+        self, folder: Path, controllers: str, seeds: str, *further: str, **environment: str
+    ) -> None:
         self.folder = folder
-        self._call = ["sweep", "--controllers", controllers, "--seeds", seeds, *further, "--out", str(folder)]
-        self._known = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), MARK: str(folder), **environment}
+        self._call = [
+            "sweep",
+            "--controllers",
+            controllers,
+            "--seeds",
+            seeds,
+            *further,
+            "--out",
+            str(folder),
+        ]
+        self._known = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+            MARK: str(folder),
+            **environment,
+        }
 
     def start(self) -> subprocess.Popen[bytes]:
         """Start it, or go on."""
-        call = [sys.executable, "-m", "servobench", *self._call, *["--resume"] * self.folder.exists()]
+        call = [
+            sys.executable,
+            "-m",
+            "servobench",
+            *self._call,
+            *["--resume"] * self.folder.exists(),
+        ]
         with self.folder.with_suffix(".txt").open("wb") as said:
             return subprocess.Popen(call, env=self._known, stdout=subprocess.DEVNULL, stderr=said)
 
@@ -86,7 +112,9 @@ class Sweep:
         return "" if told and "Traceback" not in said else said[-1500:]
 
 
-def signalled(sweep: Sweep, process: subprocess.Popen[bytes], source: random.Random, found: Outcome) -> bool:
+def signalled(
+    sweep: Sweep, process: subprocess.Popen[bytes], source: random.Random, found: Outcome
+) -> bool:
     """Send a signal at a random instant; return whether there was one before the sweep was over."""
     kind, pause = source.choice(VICTIMS), source.uniform(0.0, LATEST)
     while process.poll() is None and not _victims(process.pid)[kind]:
@@ -115,7 +143,9 @@ def _victims(command: int) -> dict[str, list[int]]:
     return dict(zip(VICTIMS, ([command], near, below), strict=True))
 
 
-def end(sweep: Sweep, process: subprocess.Popen[bytes], last: tuple[str, str], found: Outcome) -> int | None:
+def end(
+    sweep: Sweep, process: subprocess.Popen[bytes], last: tuple[str, str], found: Outcome
+) -> int | None:
     """Wait for a call to end, and for everything that it started; note the faults."""
     try:
         code = process.wait(PATIENCE)
@@ -138,7 +168,10 @@ def main() -> None:
     how = (f"0:{given.runs // 2}", "--workers", "2")
     source, found = random.Random(given.seed), Outcome()
     with tempfile.TemporaryDirectory(prefix="servobench-kills-") as scratch:
-        quiet = [Sweep(Path(scratch, f"quiet{k}"), names, *how, PEACE="1") for k, names in enumerate(BATCHES)]
+        quiet = [
+            Sweep(Path(scratch, f"quiet{k}"), names, *how, PEACE="1")
+            for k, names in enumerate(BATCHES)
+        ]
         for each in quiet:
             assert end(each, each.start(), ("none", ""), found) == 0, found.faults
         while found.signals.total() < given.kills:
@@ -155,9 +188,13 @@ def main() -> None:
             except (AssertionError, OSError) as error:
                 found.faults.append(f"table {found.tables}: {error}")
     for key, count in sorted(found.signals.items()):
-        print(f"{key[0]:10} {key[1]:5} {count:3}, lived {found.lived.get(key, 0.0):.2f} s after the end")
+        print(
+            f"{key[0]:10} {key[1]:5} {count:3}, lived {found.lived.get(key, 0.0):.2f} s after the end"
+        )
     print(
-        f"{found.signals.total()} signals, {found.tables} tables, {len(found.faults)} faults", *found.faults, sep="\n"
+        f"{found.signals.total()} signals, {found.tables} tables, {len(found.faults)} faults",
+        *found.faults,
+        sep="\n",
     )
     sys.exit(bool(found.faults))
 

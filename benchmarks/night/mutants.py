@@ -58,7 +58,9 @@ class Mutant:
     def __str__(self) -> str:
         """Return the line, and what was changed in it."""
         _, node, changed = self._find()
-        line = (ROOT / self.module).read_text(encoding="utf-8").splitlines()[node.lineno - 1].strip()
+        line = (
+            (ROOT / self.module).read_text(encoding="utf-8").splitlines()[node.lineno - 1].strip()
+        )
         before, after = (ast.unparse(each).splitlines()[0] for each in (node, changed))
         return f"{self.module}:{node.lineno}:{node.col_offset + 1}: {before}  ->  {after}    in: {line}"
 
@@ -86,11 +88,22 @@ class Mutant:
         They are those of the statement with the fault, without the statements that stand in its body.
         """
         tree, node, _ = self._find()
-        holding = [each for each in ast.walk(tree) if isinstance(each, ast.stmt) and node in ast.walk(each)]
-        if not any(part in each.body for each in holding if isinstance(each, ast.FunctionDef) for part in holding):
+        holding = [
+            each for each in ast.walk(tree) if isinstance(each, ast.stmt) and node in ast.walk(each)
+        ]
+        if not any(
+            part in each.body
+            for each in holding
+            if isinstance(each, ast.FunctionDef)
+            for part in holding
+        ):
             return None
         inner = holding[-1]
-        below = [each.lineno for each in ast.walk(inner) if isinstance(each, ast.stmt) and each is not inner]
+        below = [
+            each.lineno
+            for each in ast.walk(inner)
+            if isinstance(each, ast.stmt) and each is not inner
+        ]
         return range(inner.lineno, min(below, default=inner.end_lineno + 1))
 
 
@@ -103,7 +116,9 @@ class Imported:
         for each in gc.get_objects():
             if isinstance(each, types.FunctionType):
                 self.functions[each.__code__.co_filename].append(each)
-            elif isinstance(each, functools._lru_cache_wrapper) and str(each.__module__).startswith(ANEW):
+            elif isinstance(each, functools._lru_cache_wrapper) and str(each.__module__).startswith(
+                ANEW
+            ):
                 self._caches.append(each)
 
     def clear_caches(self) -> None:
@@ -144,7 +159,9 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
             yield ast.Constant(2.0 * value if value else 1.0)
         case ast.Attribute(attr=name) | ast.Name(id=name) if name in NAMES:
             yield _with(node, **{"attr" if isinstance(node, ast.Attribute) else "id": NAMES[name]})
-        case ast.If(test=test) | ast.IfExp(test=test) if not isinstance(test, ast.Compare | ast.BoolOp | ast.UnaryOp):
+        case ast.If(test=test) | ast.IfExp(test=test) if not isinstance(
+            test, ast.Compare | ast.BoolOp | ast.UnaryOp
+        ):
             yield _with(node, test=ast.UnaryOp(ast.Not(), test))
         case ast.Expr(value=ast.Call()) | ast.AugAssign():
             yield ast.Pass()
@@ -153,7 +170,9 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
 def mutants(module: str) -> list[Mutant]:
     """Return all mutants of a module; texts, annotations and decorators stay as they are."""
     tree = _parse(module)
-    kept = {id(below) for node in ast.walk(tree) for part in _not_code(node) for below in ast.walk(part)}
+    kept = {
+        id(below) for node in ast.walk(tree) for part in _not_code(node) for below in ast.walk(part)
+    }
     return [
         Mutant(module, place, choice)
         for place, node in enumerate(ast.walk(tree))
@@ -209,7 +228,11 @@ class Changed(importlib.machinery.SourceFileLoader):
         self._code = compile(mutant.tree(), self.path, "exec")
 
     def find_spec(self, fullname, path=None, target=None):
-        return importlib.util.spec_from_file_location(fullname, loader=self) if fullname == self.name else None
+        return (
+            importlib.util.spec_from_file_location(fullname, loader=self)
+            if fullname == self.name
+            else None
+        )
 
     def get_code(self, fullname):
         return self._code

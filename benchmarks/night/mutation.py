@@ -103,31 +103,48 @@ class Examination:
         """Try every mutant, once the tests pass without one."""
         imported = Imported()
         gc.freeze()  # so that children copy little; frozen objects are not found any more
-        files = {str(sys.modules[each.name].__file__) for each in self._mutants if each.name in sys.modules}
-        found = [answered(partial(self._trace, session, item, imported, files))[0] for item in session.items]
+        files = {
+            str(sys.modules[each.name].__file__)
+            for each in self._mutants
+            if each.name in sys.modules
+        }
+        found = [
+            answered(partial(self._trace, session, item, imported, files))[0]
+            for item in session.items
+        ]
         self.sound = bool(found) and None not in found and not session.testsfailed
         for mutant in self._mutants if self.sound else []:
             if not self._fails(session, mutant, imported, found):
                 self.survivors.append(str(mutant))
             self.tried += 1
-            print(f"\r{self.tried} of {len(self._mutants)}, {len(self.survivors)} survived ", end="", flush=True)
+            print(
+                f"\r{self.tried} of {len(self._mutants)}, {len(self.survivors)} survived ",
+                end="",
+                flush=True,
+            )
         gc.unfreeze()
         return True
 
     @staticmethod
-    def _trace(session: pytest.Session, item: pytest.Item, imported: Imported, files: set[str]) -> Reached | None:
+    def _trace(
+        session: pytest.Session, item: pytest.Item, imported: Imported, files: set[str]
+    ) -> Reached | None:
         """Return what a test reaches with its fixtures, of which a fresh process has none; None if it fails."""
         silence()
         imported.clear_caches()
         found = traced(files, lambda: _run(session, [item]))
         return None if session.testsfailed else found
 
-    def _fails(self, session: pytest.Session, mutant: Mutant, imported: Imported, found: list[Reached]) -> bool:
+    def _fails(
+        self, session: pytest.Session, mutant: Mutant, imported: Imported, found: list[Reached]
+    ) -> bool:
         """Return whether one of the tests fails with a mutant: those that reach it, the quickest first, else all."""
         lines = mutant.reach()
         file = str(sys.modules[mutant.name].__file__) if mutant.name in sys.modules else ""
         wanted = {(file, line) for line in lines or ()}
-        tests = [test for test, reached in enumerate(found) if lines is None or wanted & reached.lines]
+        tests = [
+            test for test, reached in enumerate(found) if lines is None or wanted & reached.lines
+        ]
         if not tests:
             return False
         tests.sort(key=lambda test: found[test].seconds)
@@ -148,7 +165,9 @@ class Examination:
             for name in [name for name in sys.modules if name.startswith(ANEW)]:
                 del sys.modules[name]
             sys.meta_path.insert(0, Changed(mutant))
-            sys.exit(int(pytest.main(self._arguments, plugins=[Order([item.nodeid for item in items])])))
+            sys.exit(
+                int(pytest.main(self._arguments, plugins=[Order([item.nodeid for item in items])]))
+            )
 
         code = ended(run)
         if code == BROKEN:
@@ -206,13 +225,25 @@ def _run(session: pytest.Session, items: list[pytest.Item]) -> int:
 def examine(group: str, most: int, seed: int) -> tuple[int, Examination]:
     """Return how many mutants a group has, and what came of a sample of them."""
     patterns, files = GROUPS[group]
-    modules = sorted(str(path.relative_to(ROOT)) for pattern in patterns for path in ROOT.glob(pattern))
+    modules = sorted(
+        str(path.relative_to(ROOT)) for pattern in patterns for path in ROOT.glob(pattern)
+    )
     tests = [str(ROOT / "tests" / name) for name in files]
     if missing := [test for test in tests if not Path(test).exists()]:
         sys.exit(f"the unit tests of {group} are not there: {' '.join(missing)}")
     all_of_them = [mutant for module in modules for mutant in mutants(module)]
     chosen = random.Random(seed).sample(all_of_them, min(most, len(all_of_them)))
-    options = ["-x", "-q", "-s", "--tb=no", "-p", "no:cacheprovider", f"--hypothesis-profile={PROFILE}", "-W", IMPORTED]
+    options = [
+        "-x",
+        "-q",
+        "-s",
+        "--tb=no",
+        "-p",
+        "no:cacheprovider",
+        f"--hypothesis-profile={PROFILE}",
+        "-W",
+        IMPORTED,
+    ]
     examination = Examination(chosen, [*options, *tests])
     pytest.main([*options, *tests], plugins=[examination])
     if not examination.sound:
@@ -226,21 +257,29 @@ def main() -> int:
     parser.add_argument("groups", nargs="*", help=f"of {', '.join(GROUPS)}; all by default")
     parser.add_argument("--most", type=int, default=300, help="mutants of a group")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / "mutation", help="folder of the lists")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "results" / "mutation", help="folder of the lists"
+    )
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     os.chdir(ROOT)
     phases = (Phase.explicit, Phase.generate)
-    settings.register_profile(PROFILE, deadline=None, derandomize=True, phases=phases, report_multiple_bugs=False)
+    settings.register_profile(
+        PROFILE, deadline=None, derandomize=True, phases=phases, report_multiple_bugs=False
+    )
     scores = []
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["HYPOTHESIS_STORAGE_DIRECTORY"] = folder  # so that no failure of a mutant is tried again later
+        os.environ["HYPOTHESIS_STORAGE_DIRECTORY"] = (
+            folder  # so that no failure of a mutant is tried again later
+        )
         for group in asked.groups or GROUPS:
             total, found = examine(group, asked.most, asked.seed)
             dead = found.tried - len(found.survivors)
             scores.append(dead / found.tried)
             line = f"{group}: {dead} of {found.tried} mutants found ({scores[-1]:.1%}), of {total}"
-            (asked.out / f"{group}.txt").write_text("\n".join([line, *sorted(found.survivors), ""]), encoding="utf-8")
+            (asked.out / f"{group}.txt").write_text(
+                "\n".join([line, *sorted(found.survivors), ""]), encoding="utf-8"
+            )
             print(f"\r{line}")
     return int(min(scores) < LEAST)
 

@@ -107,7 +107,9 @@ def _robot(path: Path) -> None:
 
 _config = _file("config.toml", lambda path: _configured(path, []))
 _mapping = _file("mapping.toml", partial(read_mapping, FmuMapping))
-_table, _calibration, _urdf = (_file(f"robot{ending}", _robot) for ending in (".toml", ".yaml", ".urdf"))
+_table, _calibration, _urdf = (
+    _file(f"robot{ending}", _robot) for ending in (".toml", ".yaml", ".urdf")
+)
 _waypoints = _file("waypoints.csv", lambda path: read_waypoints(path, FEATURE).sampled(0.05, 100))
 _networks = _file("networks.npz", load_networks)
 
@@ -140,13 +142,17 @@ def _fmu(content: bytes, folder: Path) -> None:
 def _mapped(path: Path, root: Path) -> None:
     description = read_description(path, root)
     parts = [""] if description.version == 3 else [".slew", ".luff"]
-    inputs, features, joints = (tuple(name + part for part in parts) for name in ("push", "place", "wheel"))
+    inputs, features, joints = (
+        tuple(name + part for part in parts) for name in ("push", "place", "wheel")
+    )
     mapping_spec(FmuMapping(path, inputs, features, joints=joints), description, 0.05)
 
 
 def _written(path: Path, content: str | bytes) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content if isinstance(content, bytes) else content.encode(errors="surrogatepass"))
+    path.write_bytes(
+        content if isinstance(content, bytes) else content.encode(errors="surrogatepass")
+    )
     return path
 
 
@@ -167,7 +173,9 @@ def of_runs(name: str, *, parts: bool = False) -> Callable[[str | bytes, Path], 
 
     def read(given: str | bytes, folder: Path) -> None:
         whole = files(parts=parts)
-        vouched = whole if name == SUMS else {each: text for each, text in whole.items() if each != SUMS}
+        vouched = (
+            whole if name == SUMS else {each: text for each, text in whole.items() if each != SUMS}
+        )
         _read_folder(_folder(folder / "out", {**vouched, name: given}))
 
     return read
@@ -176,7 +184,12 @@ def of_runs(name: str, *, parts: bool = False) -> Callable[[str | bytes, Path], 
 def part_name(name: str, folder: Path) -> None:
     """Read a folder with a stray file among the parts."""
     place = _folder(folder / "out", files(parts=True))
-    if name and not set(name) & set("/\0") and len(name.encode(errors="surrogatepass")) < 200 and name.strip("."):
+    if (
+        name
+        and not set(name) & set("/\0")
+        and len(name.encode(errors="surrogatepass")) < 200
+        and name.strip(".")
+    ):
         content = (place / results.part_name(0, results.RUNS)).read_bytes()
         (place / results.PARTS / name).write_bytes(content)
     _read_folder(place)
@@ -213,10 +226,28 @@ def cache_entry(text: str, folder: Path) -> None:
 @cache
 def files(*, parts: bool = False) -> dict[str, bytes]:
     """Return the files of a results folder by name; those of a batch under way, or at its end."""
-    keys = {"plant": "kinematic", "controller": "rls", "task": "random", "task_kind": "point_to_point"}
-    row = {"run_id": "a", **keys, "mismatch": "moderate", "seed": 0, "status": "completed", "settling_time_s": 0.5}
+    keys = {
+        "plant": "kinematic",
+        "controller": "rls",
+        "task": "random",
+        "task_kind": "point_to_point",
+    }
+    row = {
+        "run_id": "a",
+        **keys,
+        "mismatch": "moderate",
+        "seed": 0,
+        "status": "completed",
+        "settling_time_s": 0.5,
+    }
     steps = pd.DataFrame({"run_id": ["a", "a"], "time_s": [0.0, 0.05], "error_norm": [0.2, 0.1]})
-    lost = {"run_id": "b", "seed": 1, "status": "feature_lost", "settling_time_s": None, "reason": "é\n"}
+    lost = {
+        "run_id": "b",
+        "seed": 1,
+        "status": "feature_lost",
+        "settling_time_s": None,
+        "reason": "é\n",
+    }
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "out"
         results.create_folder(folder, MANIFEST)
@@ -224,7 +255,11 @@ def files(*, parts: bool = False) -> dict[str, bytes]:
         results.write_part(folder, 1, [RunResult(row | lost, None, trace="here")], "c")
         if not parts:
             results.collect(folder)
-        return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        return {
+            str(path.relative_to(folder)): path.read_bytes()
+            for path in folder.rglob("*")
+            if path.is_file()
+        }
 
 
 def _read_folder(folder: Path) -> None:
@@ -251,7 +286,9 @@ def _judged(folder: Path) -> None:
 
 @cache
 def _npz() -> bytes:
-    networks = train(TRAINING, lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))
+    networks = train(
+        TRAINING, lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2)
+    )
     with tempfile.TemporaryDirectory() as folder:
         save_networks(networks, Path(folder) / "networks.npz")
         return (Path(folder) / "networks.npz").read_bytes()
@@ -305,33 +342,97 @@ ASSIGNMENTS = (
 )
 CALIBRATIONS = tuple(calibration_text(UNIVERSAL_ROBOTS[title], 1) for title in ("UR5", "UR10e"))
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
-YAML_WORDS = ("&a ", "*a", "<<: ", "!!python/object:os.system ", "- ", "{", "}", "\t", "%YAML 9", "---", "2001-99-99")
-NUMBERS = ("nan", "inf", "-1", "0", "1e308", "1e-320", "9" * 400, "1_0", "0x10", "٣", "1e30", "91092500")
+YAML_WORDS = (
+    "&a ",
+    "*a",
+    "<<: ",
+    "!!python/object:os.system ",
+    "- ",
+    "{",
+    "}",
+    "\t",
+    "%YAML 9",
+    "---",
+    "2001-99-99",
+)
+NUMBERS = (
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1e308",
+    "1e-320",
+    "9" * 400,
+    "1_0",
+    "0x10",
+    "٣",
+    "1e30",
+    "91092500",
+)
 AXIS_WORDS = (*AXES, *PROFILES, "factory=", "=", "+", "deg", "mm", "%", ":", "/")
-TOML_WORDS = ("[", "]", "{", "}", '"', "'''", "=", ".", "\n", "true", "1979-05-27", "[[run]]", "#", "[run]", "\\u0000")
+TOML_WORDS = (
+    "[",
+    "]",
+    "{",
+    "}",
+    '"',
+    "'''",
+    "=",
+    ".",
+    "\n",
+    "true",
+    "1979-05-27",
+    "[[run]]",
+    "#",
+    "[run]",
+    "\\u0000",
+)
 XML_WORDS = (
     "<", ">", "&", "&#0;", '"', "]]>", "<!--", '<!DOCTYPE a [<!ENTITY b "c">]>', "&b;", "UTF-16", "klingon", "utf-7",
     "<Dimension start='1e9'/>", "CoSimulation", "4294967296", "structuralParameter", "<?xml version='1.1'?>",
 )  # fmt: skip
-ZIP_WORDS = ("PK\x01\x02", "PK\x03\x04", "PK\x05\x06", "PK\x06\x06", "\xff\xff\xff\xff", "../", "\x00")
+ZIP_WORDS = (
+    "PK\x01\x02",
+    "PK\x03\x04",
+    "PK\x05\x06",
+    "PK\x06\x06",
+    "\xff\xff\xff\xff",
+    "../",
+    "\x00",
+)
 
 WORDS: dict[str, Parser] = {
     "--seeds": Parser(_seeds, ("5", "3,1,4", "100:120", "7,"), (",", ":", *NUMBERS), 4),
     "--vary": Parser(
         lambda text, _: SweepPlan.parse(Batch((), (), (), (), ()), [text]),
-        ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1", "noise=0,1,2.5", "latency=0,0.1"),
+        (
+            "camera_rotation=0:180:30deg",
+            "tool=5/10/20mm",
+            "links=0:0.3:0.1",
+            "noise=0,1,2.5",
+            "latency=0,0.1",
+        ),
         (*AXIS_WORDS, *NUMBERS),
         4,
     ),
-    "--set": Parser(_set, ASSIGNMENTS, (*TOML_WORDS, *NUMBERS, "kinematic", "law", "bullet", "exp1"), 3),
+    "--set": Parser(
+        _set, ASSIGNMENTS, (*TOML_WORDS, *NUMBERS, "kinematic", "law", "bullet", "exp1"), 3
+    ),
     "--mismatch": Parser(
         _mismatch,
         ("moderate", "links=10%+tool=20mm", "factory=a.yaml", "severe+gear_ratio=5%"),
         (*AXIS_WORDS, *NUMBERS),
         4,
     ),
-    "--robot": Parser(lambda text, _: find_robot(text), ("ur5", "panda"), ("~", "#", "/", "\0", "a.yaml", ".urdf"), 2),
-    "--plants": Parser(lambda text, _: split("plants", text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")),
+    "--robot": Parser(
+        lambda text, _: find_robot(text),
+        ("ur5", "panda"),
+        ("~", "#", "/", "\0", "a.yaml", ".urdf"),
+        2,
+    ),
+    "--plants": Parser(
+        lambda text, _: split("plants", text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")
+    ),
     "--controllers": Parser(
         lambda text, _: split("controllers", text),
         ("ukf_mfac,rbf_pid", "mfac+rls", "ukf_mfac:published"),
@@ -339,7 +440,10 @@ WORDS: dict[str, Parser] = {
     ),
     "--tasks": Parser(lambda text, _: split("tasks", text), ("exp1,circle", "all"), (",", "\0")),
     "--platforms": Parser(
-        lambda text, _: parse_platforms(text), ("x86_64-linux,aarch64-darwin", "all"), (",",), error=ValueError
+        lambda text, _: parse_platforms(text),
+        ("x86_64-linux,aarch64-darwin", "all"),
+        (",",),
+        error=ValueError,
     ),
 }
 """What stands on the command line."""
@@ -349,16 +453,32 @@ FILES: dict[str, Parser] = {
     "mapping": Parser(_mapping, (MAPPING,), (*TOML_WORDS, *NUMBERS), 2, error=ValueError),
     "DH table": Parser(_table, (FOUR_JOINTS,), (*TOML_WORDS, *NUMBERS), 0.02),
     "calibration": Parser(_calibration, CALIBRATIONS, (*YAML_WORDS, *NUMBERS), 0.1),
-    "URDF": Parser(_urdf, (odd_urdf(),), (*XML_WORDS, *NUMBERS, "prismatic", "mimic", "floating"), 0.02),
-    "waypoints": Parser(_waypoints, (CSV,), (",", "\n", '"', "\0", ";", *NUMBERS), 2, error=ValueError),
+    "URDF": Parser(
+        _urdf, (odd_urdf(),), (*XML_WORDS, *NUMBERS, "prismatic", "mimic", "floating"), 0.02
+    ),
+    "waypoints": Parser(
+        _waypoints, (CSV,), (",", "\n", '"', "\0", ";", *NUMBERS), 2, error=ValueError
+    ),
     "networks": Parser(
-        _networks, (_npz(),), (*ZIP_WORDS, "<f8", "|O", "shape", "(1000000000000,)"), 0.5, error=ValueError
+        _networks,
+        (_npz(),),
+        (*ZIP_WORDS, "<f8", "|O", "shape", "(1000000000000,)"),
+        0.5,
+        error=ValueError,
     ),
     "modelDescription": Parser(
-        _description, (describe(2), describe(3), describe_exchange()), (*XML_WORDS, *NUMBERS), 0.3, error=ValueError
+        _description,
+        (describe(2), describe(3), describe_exchange()),
+        (*XML_WORDS, *NUMBERS),
+        0.3,
+        error=ValueError,
     ),
     "FMU archive": Parser(
-        _fmu, tuple(packed(2 + i % 2, method) for i, method in enumerate(METHODS)), ZIP_WORDS, 0.3, error=ValueError
+        _fmu,
+        tuple(packed(2 + i % 2, method) for i, method in enumerate(METHODS)),
+        ZIP_WORDS,
+        0.3,
+        error=ValueError,
     ),
     "reference run": Parser(
         lambda text, _: read_table(text),
@@ -371,14 +491,38 @@ FILES: dict[str, Parser] = {
 """What stands in files."""
 
 JSON_WORDS = ('"', "{", "}", "[", "]", ":", ",", "null", "true", "\\ud800", "1e999", "NaN", "\n")
-TABLE_WORDS = ("PAR1", "\x00", "\xff\xff\xff\xff", "run_id", "status", "seed", "\x15\x00", "\x15\x0c", "\x80\x80\x04")
+TABLE_WORDS = (
+    "PAR1",
+    "\x00",
+    "\xff\xff\xff\xff",
+    "run_id",
+    "status",
+    "seed",
+    "\x15\x00",
+    "\x15\x0c",
+    "\x80\x80\x04",
+)
 RESULTS: dict[str, Parser] = {
-    "manifest": Parser(of_runs("manifest.json"), (files()["manifest.json"].decode(),), (*JSON_WORDS, *NUMBERS), 0.05),
-    "checksums": Parser(of_runs("SHA256SUMS"), (files()["SHA256SUMS"].decode(),), ("  ", "\n", "parts/", "../"), 0.05),
+    "manifest": Parser(
+        of_runs("manifest.json"),
+        (files()["manifest.json"].decode(),),
+        (*JSON_WORDS, *NUMBERS),
+        0.05,
+    ),
+    "checksums": Parser(
+        of_runs("SHA256SUMS"),
+        (files()["SHA256SUMS"].decode(),),
+        ("  ", "\n", "parts/", "../"),
+        0.05,
+    ),
     "table of runs": Parser(of_runs("runs.parquet"), (files()["runs.parquet"],), TABLE_WORDS, 0.09),
-    "table of steps": Parser(of_runs("steps.parquet"), (files()["steps.parquet"],), TABLE_WORDS, 0.05),
+    "table of steps": Parser(
+        of_runs("steps.parquet"), (files()["steps.parquet"],), TABLE_WORDS, 0.05
+    ),
     "part": Parser(of_runs(PART, parts=True), (files(parts=True)[PART],), TABLE_WORDS, 0.09),
-    "part name": Parser(part_name, ("00000000.runs.parquet",), (".", "x", ".runs.parquet", *NUMBERS[:6]), 0.02),
+    "part name": Parser(
+        part_name, ("00000000.runs.parquet",), (".", "x", ".runs.parquet", *NUMBERS[:6]), 0.02
+    ),
     "other table": Parser(other_table, ("a,b\n1,2\n",), (",", "\n", '"', "\0", *NUMBERS), 0.3),
     "lock": Parser(lock, (HOLDER,), (*JSON_WORDS, *NUMBERS), 1),
     "journal": Parser(journal, (LEDGER,), (*JSON_WORDS, *NUMBERS), 1),

@@ -19,8 +19,26 @@ from kit.served import SPEED, Bytes, packed, served
 from measuring import options
 from servobench.harness.serve.server import PORTS
 
-NAMES = (*SPEED, "actual_q", "timestamp", "input_int_register_24", "nonsense", "standard_digital_output", "", "é")
-WORDS = (b"stop", b"running", b"unlock protective stop", b"play", b"quit", b"PolyscopeVersion", b"\xff\xfe", b"")
+NAMES = (
+    *SPEED,
+    "actual_q",
+    "timestamp",
+    "input_int_register_24",
+    "nonsense",
+    "standard_digital_output",
+    "",
+    "é",
+)
+WORDS = (
+    b"stop",
+    b"running",
+    b"unlock protective stop",
+    b"play",
+    b"quit",
+    b"PolyscopeVersion",
+    b"\xff\xfe",
+    b"",
+)
 NUMBERS = (0.0, 1.0, -1.0, math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 1e-9, 0.3)
 
 METHODS = (b"GET", b"POST", b"OPTIONS", b"CONNECT", b"PRI", b"post", b"S", b"!", b"def")
@@ -28,10 +46,26 @@ METHODS = (b"GET", b"POST", b"OPTIONS", b"CONNECT", b"PRI", b"post", b"S", b"!",
 
 def browser(draw):
     """Return what a browser sends first, by HTTP, TLS or STUN, and behind it what a port carries out."""
-    line = draw.choice(METHODS) + draw.choice((b" / HTTP/1.1\r\n", b" http://x/ HTTP/1.1\r\n", b" * HTTP/2.0\r\n"))
-    first = draw.choice((line, line, b"\r\n" + line, b"\x16\x03\x01\x02\x00\x01", b"\x00\x03\x00\x1c\x21\x12\xa4\x42"))
-    packets = first.ljust(int.from_bytes(first[:2]), b"x") + packed("I", ",".join(SPEED).encode()) + packed("S")
-    return draw.choice((packets, first + b"\nend\ndef rtde_control():\nend\n", first + b"\r\n\r\nstop\npictures\n"))
+    line = draw.choice(METHODS) + draw.choice(
+        (b" / HTTP/1.1\r\n", b" http://x/ HTTP/1.1\r\n", b" * HTTP/2.0\r\n")
+    )
+    first = draw.choice(
+        (
+            line,
+            line,
+            b"\r\n" + line,
+            b"\x16\x03\x01\x02\x00\x01",
+            b"\x00\x03\x00\x1c\x21\x12\xa4\x42",
+        )
+    )
+    packets = (
+        first.ljust(int.from_bytes(first[:2]), b"x")
+        + packed("I", ",".join(SPEED).encode())
+        + packed("S")
+    )
+    return draw.choice(
+        (packets, first + b"\nend\ndef rtde_control():\nend\n", first + b"\r\n\r\nstop\npictures\n")
+    )
 
 
 def wire(draw):
@@ -50,14 +84,22 @@ def wire(draw):
             whole = packed("I", ",".join(SPEED).encode()) + packed("S")
             return whole[: draw.randrange(1, len(whole))]
         case 5:
-            return struct.pack(">HB", draw.randrange(65536), draw.randrange(256)) + draw.randbytes(20)
+            return struct.pack(">HB", draw.randrange(65536), draw.randrange(256)) + draw.randbytes(
+                20
+            )
         case 6:
             version = packed("V", struct.pack(">H", draw.randrange(4)))
-            return version + packed("M", draw.randbytes(draw.randrange(8))) + packed("O", b"timestamp,actual_q")
+            return (
+                version
+                + packed("M", draw.randbytes(draw.randrange(8)))
+                + packed("O", b"timestamp,actual_q")
+            )
         case _:
             body = struct.pack(">i8d", draw.randrange(-3, 260), *draw.choices(NUMBERS, k=8))
             number = draw.choice((b"\x01", b"\x01", b"\x01", b"\x02", b"\x00"))
-            return packed("I", ",".join(SPEED).encode()) + packed("U", number + body[: draw.choice((68, 68, 40))])
+            return packed("I", ",".join(SPEED).encode()) + packed(
+                "U", number + body[: draw.choice((68, 68, 40))]
+            )
 
 
 def inputs(port, draw):
@@ -70,10 +112,22 @@ def inputs(port, draw):
         line = draw.choice(WORDS) if draw.random() < 0.5 else draw.randbytes(draw.randrange(60))
         return line + draw.choice((b"\n", b"\n", b"")) + b"x" * draw.choice((0, 0, 0, 0, 5000))
     if port == "script":
-        text = draw.choice((b"", b"def rtde_control():\n", b"Script Loaded (\xff)", b"Script Loaded (1.1.30)"))
-        return text + draw.randbytes(draw.randrange(60)) + draw.choice((b"\nend\n", b"\nend\n\nend\n", b""))
+        text = draw.choice(
+            (b"", b"def rtde_control():\n", b"Script Loaded (\xff)", b"Script Loaded (1.1.30)")
+        )
+        return (
+            text
+            + draw.randbytes(draw.randrange(60))
+            + draw.choice((b"\nend\n", b"\nend\n\nend\n", b""))
+        )
     return draw.choice(
-        (b"pictures\n", b"", draw.randbytes(draw.randrange(60)), draw.randbytes(20) + b"\n", b"x" * 5000)
+        (
+            b"pictures\n",
+            b"",
+            draw.randbytes(draw.randrange(60)),
+            draw.randbytes(20) + b"\n",
+            b"x" * 5000,
+        )
     )
 
 
@@ -95,7 +149,9 @@ def main() -> None:
     given = options(__doc__, inputs=100_000, seed=0)
     found, logged = [], []
     handler = logging.Handler()
-    handler.emit = lambda record: logged.append(f"{record.getMessage()} {record.exc_info and record.exc_info[1]!r}")
+    handler.emit = lambda record: logged.append(
+        f"{record.getMessage()} {record.exc_info and record.exc_info[1]!r}"
+    )
     logging.getLogger("asyncio").addHandler(handler)
     for port in PORTS:
         draw, most, before, kinds = random.Random(given.seed), 0, time.monotonic(), Counter()

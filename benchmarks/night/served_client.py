@@ -58,5 +58,7 @@ def run(host: str, fault: str, at: int, place: str) -> None:
         "run": {"lost_after": 0.1},
         "target": {"duration": 3.0},
     }
-    done = servobench.run(Swing, ON_A_UR, task="target", mismatch="none", robot="ur5e", settings=settings)
+    done = servobench.run(
+        Swing, ON_A_UR, task="target", mismatch="none", robot="ur5e", settings=settings
+    )
     Path(place).write_text(f"{done.row['status']}: {done.row['reason']}", encoding="utf-8")

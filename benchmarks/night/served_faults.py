@@ -35,12 +35,27 @@ from servobench.harness.serve.server import PORTS
 
 LIMIT = 0.25  # [rad/s] of on_a_ur.py
 PERIOD = 25  # periods of the server in one of the controller
-RAMP = math.ceil(LIMIT / 10.0 / 0.002) + 3  # periods of the server that a stop takes, and its hand-over
+# Periods of the server that a stop takes, and its hand-over
+RAMP = math.ceil(LIMIT / 10.0 / 0.002) + 3
 PATIENCE = 25.0  # [s] until a client has ended
 ATTEMPTS = 3  # at a trial, where the machine was too slow for the server
-BY_CONTROLLER = ("NaN of the controller", "hanging controller", "late controller", "exception", "beyond limits")
+BY_CONTROLLER = (
+    "NaN of the controller",
+    "hanging controller",
+    "late controller",
+    "exception",
+    "beyond limits",
+)
 BY_CAMERA = ("frozen camera", "camera without frames", "lost frames")
-BY_RELAY = ("cut", "half a packet", "late packets", "doubled packets", "NaN on the wire", "wrong recipe", *BY_CAMERA)
+BY_RELAY = (
+    "cut",
+    "half a packet",
+    "late packets",
+    "doubled packets",
+    "NaN on the wire",
+    "wrong recipe",
+    *BY_CAMERA,
+)
 BY_FORCE = ("protective stop", "killed server", "killed client", "Ctrl-C", "stopped client")
 HARMLESS = ("doubled packets", "beyond limits")  # after which a run goes on
 
@@ -49,7 +64,13 @@ class Relay:
     """Passes bytes of all ports on, and does harm once it is told to."""
 
     def __init__(self, server: str, commands: list) -> None:
-        self.server, self.address, self.fault, self.commands, self.onset = server, fresh_address(), "", commands, 0
+        self.server, self.address, self.fault, self.commands, self.onset = (
+            server,
+            fresh_address(),
+            "",
+            commands,
+            0,
+        )
         self._open, self._listening, self._frame = [], [], None
         for port in PORTS.values():
             listening = socket.create_server((self.address, port))
@@ -68,7 +89,10 @@ class Relay:
                 server = socket.create_connection((self.server, port))
             except OSError:
                 return
-            for each in (client, server):  # otherwise a small packet waits for the answer to the one before
+            for each in (
+                client,
+                server,
+            ):  # otherwise a small packet waits for the answer to the one before
                 each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._open += [client, server]
             change = self._packets if port == PORTS["RTDE"] else self._whole
@@ -125,9 +149,13 @@ class Relay:
         if self.fault == "camera without frames":
             return [], rest
         if self.fault == "lost frames":
-            lines = [json.dumps(json.loads(line) | {"valid": [False] * 3}).encode() for line in lines]
+            lines = [
+                json.dumps(json.loads(line) | {"valid": [False] * 3}).encode() for line in lines
+            ]
         if self.fault == "frozen camera":
-            lines = [json.dumps(json.loads(line) | {"feature": self._frame}).encode() for line in lines]
+            lines = [
+                json.dumps(json.loads(line) | {"feature": self._frame}).encode() for line in lines
+            ]
         elif lines:
             self._frame = json.loads(lines[-1])["feature"]
         return [line + b"\n" for line in lines], rest
@@ -162,11 +190,16 @@ def recorded(server):
 def trial(fault, draw, context):
     """Return how a run with a fault went: its end, what was wrong, and whether the server left periods out."""
     wrong, settings = [], {"kinematic": {"sensing": {"frame_period": 0.05}}}
-    with served(settings=settings, lockstep=False) as (server, address, said), recorded(server) as (commands, last):
+    with (
+        served(settings=settings, lockstep=False) as (server, address, said),
+        recorded(server) as (commands, last),
+    ):
         relay = Relay(address, commands)
         with tempfile.NamedTemporaryFile("w", suffix=".txt") as place:
             at = draw.randrange(4, 25) if fault in BY_CONTROLLER else 10**9
-            client = context.Process(target=served_client.run, args=(relay.address, fault, at, place.name))
+            client = context.Process(
+                target=served_client.run, args=(relay.address, fault, at, place.name)
+            )
             client.start()
             if not waited_for(lambda: last[0] > 0 or not client.is_alive(), 60.0):
                 wrong.append("the client never commands")
@@ -235,7 +268,11 @@ def main() -> None:
                 break
             if attempt + 1 < ATTEMPTS:
                 repeated += 1
-                print(f"{number} {kind}: {wrong}, but the machine was too slow: once more", file=sys.stderr, flush=True)
+                print(
+                    f"{number} {kind}: {wrong}, but the machine was too slow: once more",
+                    file=sys.stderr,
+                    flush=True,
+                )
         ends[kind][end[:70]] += 1
         early[kind] += was_early
         longest[kind] = max(longest[kind], after)
@@ -245,8 +282,12 @@ def main() -> None:
     for kind in kinds:
         words = "; ".join(f"{count}x {end}" for end, count in ends[kind].most_common(3))
         moved = f"moved at most {2 * longest[kind]} ms after"
-        print(f"{kind:24s} {ends[kind].total():4d} runs, {early[kind]} over before, {moved}; {words}")
-    print(f"{given.faults} faults, {len(faults)} findings, {repeated} trials repeated on a machine too slow")
+        print(
+            f"{kind:24s} {ends[kind].total():4d} runs, {early[kind]} over before, {moved}; {words}"
+        )
+    print(
+        f"{given.faults} faults, {len(faults)} findings, {repeated} trials repeated on a machine too slow"
+    )
     sys.exit(bool(faults))
 
 

@@ -68,7 +68,12 @@ MEMORY: Final = 4 * 10**9  # [bytes] more addresses than the parent has
 def good_folders(place: Path) -> list[Path]:
     """Return a finished comparison, one that was left behind half-way, and a part of a batch."""
     batch = ["compare", *BATCH.split(), *SHORT.split(), "--out"]
-    for name, further in (("whole", []), ("half", []), ("part", ["--part", "1/2"]), ("other", ["--part", "2/2"])):
+    for name, further in (
+        ("whole", []),
+        ("half", []),
+        ("part", ["--part", "1/2"]),
+        ("other", ["--part", "2/2"]),
+    ):
         assert call([*batch, str(place / name), *further]) == 0, name
     half = place / "half"
     runs, steps = pd.read_parquet(half / results.RUNS), pd.read_parquet(half / results.STEPS)
@@ -85,7 +90,11 @@ def good_folders(place: Path) -> list[Path]:
 def sign(folder: Path) -> None:
     """Write checksums of all files as they are."""
     names = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink()]
-    lines = (f"{digest(path)}  {path.relative_to(folder)}\n" for path in names if path.name not in (SUMS, ".lock"))
+    lines = (
+        f"{digest(path)}  {path.relative_to(folder)}\n"
+        for path in names
+        if path.name not in (SUMS, ".lock")
+    )
     if (folder / SUMS).is_file() and not (folder / SUMS).is_symlink():
         (folder / SUMS).write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
 
@@ -98,16 +107,29 @@ def change_table(folder: Path, source: random.Random) -> None:
     index, value, kind = table.column_names.index(name), source.choice(VALUES), source.randrange(8)
     cells = table[name].to_pylist()
     if kind < 3:
-        cells = [value] * len(cells) if kind else [value if k == 0 else cell for k, cell in enumerate(cells)]
+        cells = (
+            [value] * len(cells)
+            if kind
+            else [value if k == 0 else cell for k, cell in enumerate(cells)]
+        )
         table = table.set_column(index, name, pa.array(cells))
     elif kind == 3:
         table = table.drop_columns(name)
     elif kind == 4:
-        table = table.rename_columns([source.choice(PAYLOADS) if each == name else each for each in table.column_names])
+        table = table.rename_columns(
+            [source.choice(PAYLOADS) if each == name else each for each in table.column_names]
+        )
     elif kind == 5:
-        table = table.append_column(source.choice([*PAYLOADS, name]), pa.array([value] * len(cells)))
+        table = table.append_column(
+            source.choice([*PAYLOADS, name]), pa.array([value] * len(cells))
+        )
     elif kind == 6:
-        other = (table.slice(0, 0), table.slice(1), pa.concat_tables([table, table]), table.take([0] * 9))
+        other = (
+            table.slice(0, 0),
+            table.slice(1),
+            pa.concat_tables([table, table]),
+            table.take([0] * 9),
+        )
         table = source.choice(other)
     else:
         swapped = source.choice(cells)
@@ -141,7 +163,9 @@ def change_manifest(folder: Path, source: random.Random) -> None:
 
 def change_bytes(folder: Path, source: random.Random) -> None:
     """Change a file a little or much."""
-    path = source.choice([each for each in sorted(folder.rglob("*")) if each.is_file() and not each.is_symlink()])
+    path = source.choice(
+        [each for each in sorted(folder.rglob("*")) if each.is_file() and not each.is_symlink()]
+    )
     path.write_bytes(bytes(drawn(Parser(print, (path.read_bytes(),), PAYLOADS[:4]), source)))
 
 
@@ -157,9 +181,13 @@ def change_names(folder: Path, source: random.Random) -> None:
     elif kind == 2:
         (folder / f"{word}{path.suffix}").write_bytes(path.read_bytes())
     elif kind == 3:
-        (folder / source.choice((".lock", "more.csv", "report.html", "x.parquet"))).write_text(source.choice(PAYLOADS))
+        (folder / source.choice((".lock", "more.csv", "report.html", "x.parquet"))).write_text(
+            source.choice(PAYLOADS)
+        )
     elif kind == 4:
-        place = folder / source.choice((".lock", "report.html", "figures", "more.csv", "recordings"))
+        place = folder / source.choice(
+            (".lock", "report.html", "figures", "more.csv", "recordings")
+        )
         place.symlink_to(source.choice((folder.parent / "victim.csv", folder.parent)))
     elif kind == 5:
         path.symlink_to(folder.parent / "victim.csv")
@@ -186,7 +214,9 @@ def call(arguments: list[str]) -> int | str:
     return 0
 
 
-def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, object]) -> list[tuple[str, str]]:
+def attempt(
+    number: int, goods: list[Path], place: Path, wanted: dict[str, object]
+) -> list[tuple[str, str]]:
     """Change a folder, give it to commands, and return the faults; in a child."""
     source = random.Random(number)
     good = source.choice(goods)
@@ -196,7 +226,13 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     for change in source.choices(CHANGES, k=source.choice((1, 1, 2, 3))):
         try:
             change(folder, source)
-        except (pa.ArrowException, OSError, ValueError, TypeError, IndexError):  # no such file, or none
+        except (
+            pa.ArrowException,
+            OSError,
+            ValueError,
+            TypeError,
+            IndexError,
+        ):  # no such file, or none
             continue
     signed = source.random() < 0.8
     if signed:
@@ -205,9 +241,15 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     os.environ["XDG_CACHE_HOME"] = str(place / "cache")
     faults, changed = [], not (signed or _same_files(folder, good))
     drawn_commands = source.choices(list(COMMANDS), list(COMMANDS.values()), k=2)
-    for command in sorted(drawn_commands, key=lambda each: "--resume" in each or "collect" in each):  # which mend it
-        faults += [(command, fault) for fault in _faults(command, folder, good, wanted, changed=changed)]
-    if (place / "home" / "victim.csv").read_text() != "precious" or len(list((place / "home").iterdir())) > 2:
+    for command in sorted(
+        drawn_commands, key=lambda each: "--resume" in each or "collect" in each
+    ):  # which mend it
+        faults += [
+            (command, fault) for fault in _faults(command, folder, good, wanted, changed=changed)
+        ]
+    if (place / "home" / "victim.csv").read_text() != "precious" or len(
+        list((place / "home").iterdir())
+    ) > 2:
         faults.append(("", "outside: the home of the folder was changed"))
     return faults
 
@@ -221,18 +263,26 @@ def laid_out(good: Path, place: Path) -> Path:
     return Path(shutil.copytree(good, place / "home" / "folder"))
 
 
-def _faults(command: str, folder: Path, good: Path, wanted: dict[str, object], *, changed: bool) -> list[str]:
+def _faults(
+    command: str, folder: Path, good: Path, wanted: dict[str, object], *, changed: bool
+) -> list[str]:
     place = folder.parents[1]
     shutil.rmtree(place / "out" / "csv", ignore_errors=True)
     with noting() as noted:
         code, out, error = _captured(command.format(folder).split(), place)
-    allowed = [os.path.realpath(place / name) for name in ("home/folder", "temporary", "cache", "out")]
-    outside = [each for each in noted if not any(f"{each[1]}/".startswith(f"{root}/") for root in allowed)]
+    allowed = [
+        os.path.realpath(place / name) for name in ("home/folder", "temporary", "cache", "out")
+    ]
+    outside = [
+        each for each in noted if not any(f"{each[1]}/".startswith(f"{root}/") for root in allowed)
+    ]
     faults = [f"outside: {each}" for each in outside if each[1] != os.devnull]
     if isinstance(code, str) or "Traceback" in error:
         faults.append(code if isinstance(code, str) else f"trace: {error[-300:]}")
     elif code == 2:
-        if error.count("servobench: ") != 1 or error.count("\n") > 2:  # a word of an unfinished batch first
+        if (
+            error.count("servobench: ") != 1 or error.count("\n") > 2
+        ):  # a word of an unfinished batch first
             faults.append(f"lines: {error[-300:]!r}")
     elif code == 0 and changed and command.startswith("verify"):
         faults.append("silent: verify takes changed files")
@@ -260,7 +310,11 @@ def _captured(arguments: list[str], place: Path) -> tuple[int | str, str, str]:
 def _same_files(folder: Path, good: Path) -> bool:
     """Return whether all files that the good folder vouches for are as they were; a lost part is one that never was."""
     vouched = [line.split("  ", 1)[1] for line in (good / SUMS).read_text().splitlines()]
-    lost = [name for name in vouched if name.endswith(f".{results.RUNS}") and not os.path.lexists(folder / name)]
+    lost = [
+        name
+        for name in vouched
+        if name.endswith(f".{results.RUNS}") and not os.path.lexists(folder / name)
+    ]
     names = [name for name in (*vouched, SUMS) if (good / name).is_file() and name not in lost]
     return all(_content(folder / name) == _content(good / name) for name in names)
 
@@ -279,12 +333,18 @@ def _equal_tables(folder: Path, exported: Path) -> bool:
     """Return whether the numbers of runs.csv are those of the table, row by row."""
     if not (folder / results.RUNS).is_file():
         return True
-    table, csv = pd.read_parquet(folder / results.RUNS), pd.read_csv(exported / "runs.csv", low_memory=False)
+    table, csv = (
+        pd.read_parquet(folder / results.RUNS),
+        pd.read_csv(exported / "runs.csv", low_memory=False),
+    )
     numbers = [name for name in table.select_dtypes("number") if name in csv]
     if len(table) != len(csv):
         return False
     written = csv[numbers].apply(pd.to_numeric, errors="coerce")
-    return all(((written[name] == table[name]) | (written[name].isna() & table[name].isna())).all() for name in numbers)
+    return all(
+        ((written[name] == table[name]) | (written[name].isna() & table[name].isna())).all()
+        for name in numbers
+    )
 
 
 def in_child(work: Callable[[], object]) -> list[tuple[str, str]]:
@@ -301,7 +361,11 @@ def in_child(work: Callable[[], object]) -> list[tuple[str, str]]:
             return [("", f"tool: {traceback.format_exc()}")]
 
     found, status = answered(limited, HANG)
-    return [("", f"hang: {HANG:g} s or {CPU} s of the processor; status {status}")] if found is None else found
+    return (
+        [("", f"hang: {HANG:g} s or {CPU} s of the processor; status {status}")]
+        if found is None
+        else found
+    )
 
 
 def main() -> None:
@@ -315,7 +379,9 @@ def main() -> None:
         wanted: dict[str, object] = {}
         for good in goods:
             for command in UNCHANGED:
-                found = in_child(lambda: [(command, _good_output(command, good, place / "undisturbed"))])  # noqa: B023
+                found = in_child(
+                    lambda: [(command, _good_output(command, good, place / "undisturbed"))]  # noqa: B023
+                )
                 wanted[f"{good}{command}"] = found[0][1]
         for number in range(given.first, given.first + given.folders):
             for command, fault in in_child(lambda: attempt(number, goods, place / "point", wanted)):  # noqa: B023
@@ -324,7 +390,9 @@ def main() -> None:
                     print(f"{number}: {command}: {fault}", flush=True)
             if number % 500 == 0:
                 print(f"{number}: {time.monotonic() - began:.0f} s", flush=True)
-    print(f"{given.folders} folders, {2 * given.folders} commands, {time.monotonic() - began:.0f} s: {dict(counts)}")
+    print(
+        f"{given.folders} folders, {2 * given.folders} commands, {time.monotonic() - began:.0f} s: {dict(counts)}"
+    )
     sys.exit(bool(counts))
 
 

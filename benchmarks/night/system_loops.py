@@ -36,17 +36,32 @@ class Loop(NamedTuple):
 
 
 LOOPS = (
-    *(Loop(name + how) for name in ("ukf_mfac", "rbf_pid", "rbfnn_mfac") for how in ("", ":published")),
+    *(
+        Loop(name + how)
+        for name in ("ukf_mfac", "rbf_pid", "rbfnn_mfac")
+        for how in ("", ":published")
+    ),
     Loop("regression_mfac"),
     *(Loop("ukf_mfac:published", robot) for robot in ("ur10e", "panda")),
     Loop("regression_mfac", "ur10e"),
-    *(Loop("ukf_mfac:published", sensing=sensing) for sensing in ("pixel", "pixel:hand", "stereo", "plate")),
+    *(
+        Loop("ukf_mfac:published", sensing=sensing)
+        for sensing in ("pixel", "pixel:hand", "stereo", "plate")
+    ),
 )
 
 
 def write(loop: Loop, folder: Path) -> Path:
     """Write the system of a loop, of one robot of moderate mismatch, into a folder."""
-    request = RunRequest("kinematic", loop.controller, "target", MISMATCH, SEED, robot=loop.robot, sensing=loop.sensing)
+    request = RunRequest(
+        "kinematic",
+        loop.controller,
+        "target",
+        MISMATCH,
+        SEED,
+        robot=loop.robot,
+        sensing=loop.sensing,
+    )
     plant, controller, stop = loop_products(request, Settings())
     return write_loop(folder / "loop.ssp", plant, controller, (this_platform(),), stop)
 
@@ -67,7 +82,9 @@ def both(loop: Loop, path: Path) -> tuple[np.ndarray, np.ndarray]:
     for name, prefix in (("plant.encoder_position", "joint_position_"), (feature, "true_feature_")):
         columns = [column for column in steps if column.startswith(prefix)]
         wanted.append(steps[columns].to_numpy()[:rows])
-        found.append(np.column_stack([came[f"{name}[{i + 1}]"] for i in range(len(columns))])[:rows])
+        found.append(
+            np.column_stack([came[f"{name}[{i + 1}]"] for i in range(len(columns))])[:rows]
+        )
     return np.hstack(found), np.hstack(wanted)
 
 
@@ -90,7 +107,10 @@ def main() -> int:
             continue
         wrong += not agree(loop, found, wanted)
         apart, moved = np.abs(found - wanted).max(), np.ptp(wanted, axis=0).max()
-        print(f"{' '.join(loop)}: {len(wanted)} periods, {apart:.1e} apart, moved by {moved:.2f}", flush=True)
+        print(
+            f"{' '.join(loop)}: {len(wanted)} periods, {apart:.1e} apart, moved by {moved:.2f}",
+            flush=True,
+        )
     return int(wrong > 0)
 
 

@@ -23,7 +23,9 @@ MACHINES = [
     pytest.param(
         machine,
         id=machine.name,
-        marks=pytest.mark.skipif(bool(machine.lacking), reason=f"{machine.name} needs {machine.lacking}"),
+        marks=pytest.mark.skipif(
+            bool(machine.lacking), reason=f"{machine.name} needs {machine.lacking}"
+        ),
     )
     for machine in machines()
 ]
@@ -45,7 +47,8 @@ def test_the_arm_moves_alike_over_a_thousand_random_steps(version, machine, tmp_
     commands = np.random.default_rng(1).uniform(-1.3, 1.3, (STEPS, 6))
     unpacked = unpack(made, (this_platform(), machine.platform), tmp_path)
     here, there = (
-        drive(unpacked, made, each, commands, first=first, step=PERIOD, home=home) for each in (None, machine)
+        drive(unpacked, made, each, commands, first=first, step=PERIOD, home=home)
+        for each in (None, machine)
     )
     assert here.shape == there.shape == (STEPS, made.description.layout.size)
     assert np.ptp(here, axis=0).max() > 1.0
@@ -58,7 +61,9 @@ def test_a_controller_commands_as_its_original_does(machine, tmp_path, home):
     made, (*rows,) = recorded("ukf_mfac").product(2), periods(experiment("ukf_mfac"))
     inputs = np.array([inputs_of(seen, desired) for seen, desired, _ in rows])
     unpacked = unpack(made, (machine.platform,), tmp_path)
-    there = drive(unpacked, made, machine, inputs, step=PERIOD, home=home)[:, inputs.shape[1] :][:, :6]
+    there = drive(unpacked, made, machine, inputs, step=PERIOD, home=home)[:, inputs.shape[1] :][
+        :, :6
+    ]
     wanted = np.array([command.joint_velocity for *_, command in rows])
     assert np.ptp(wanted, axis=0).max() > 0.1
     np.testing.assert_allclose(there, wanted, rtol=0, atol=1e-9)

@@ -17,7 +17,13 @@ import pandas as pd
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from kit.command import judged
 from servobench.harness.batch import results
@@ -35,7 +41,8 @@ BATCH = Batch(("kinematic",), ("constant",), ("random",), ("moderate",), range(R
 CAMPAIGN = Campaign(SweepPlan(BATCH).cells(), Settings({"random": {"duration": 0.15}}), steps=True)
 ANSWER_LIMIT = 120.0  # [s] of a process, on a busy machine
 GO, STOP, DONE, STOPPED = "go", "stop", "done", "stopped"
-LOST = ("is not a results folder", "are not of this batch", "holds no finished run")  # where nothing can be saved
+# Where nothing can be saved
+LOST = ("is not a results folder", "are not of this batch", "holds no finished run")
 MANY = settings(max_examples=8, stateful_step_count=14, deadline=None)
 
 
@@ -53,7 +60,9 @@ class Waits(Observer):
 
 def work(link, folder: Path, resume: bool) -> None:
     """Carry the batch out in a process and say how that ended."""
-    how = Execution(workers=1, block=1, resume=resume, observer=Waits(link), bounds=Bounds(isolate=False))
+    how = Execution(
+        workers=1, block=1, resume=resume, observer=Waits(link), bounds=Bounds(isolate=False)
+    )
     try:
         carry_out(CAMPAIGN, folder, how)
     except KeyboardInterrupt:
@@ -94,7 +103,11 @@ class Worker:
 @cache
 def undisturbed() -> tuple[pd.DataFrame, pd.DataFrame]:
     with tempfile.TemporaryDirectory() as name:
-        carry_out(CAMPAIGN, Path(name) / "out", Execution(workers=1, block=1, bounds=Bounds(isolate=False)))
+        carry_out(
+            CAMPAIGN,
+            Path(name) / "out",
+            Execution(workers=1, block=1, bounds=Bounds(isolate=False)),
+        )
         return tables(Path(name) / "out")
 
 
@@ -102,7 +115,9 @@ def tables(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     return judged(results.load_runs(folder)), judged(results.load_steps(folder))
 
 
-def assert_equal(found: tuple[pd.DataFrame, pd.DataFrame], wanted: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+def assert_equal(
+    found: tuple[pd.DataFrame, pd.DataFrame], wanted: tuple[pd.DataFrame, pd.DataFrame]
+) -> None:
     for table, whole in zip(found, wanted, strict=True):
         pd.testing.assert_frame_equal(table, whole.reset_index(drop=True), check_exact=True)
 
@@ -122,7 +137,9 @@ class FolderLife(RuleBasedStateMachine):
         worker = Worker(self.folder, resume)
         answer = worker.answer()
         if self.writer is not None:
-            assert "is being written by process" in answer or (not resume and "exists already" in answer), answer
+            assert "is being written by process" in answer or (
+                not resume and "exists already" in answer
+            ), answer
             assert self.content() == before
         elif not resume and before:
             assert "exists already" in answer, answer
@@ -147,10 +164,16 @@ class FolderLife(RuleBasedStateMachine):
         self.writer = None
 
     @precondition(lambda self: self.writer is None)
-    @rule(data=st.data(), share=st.floats(0.0, 0.99), how=st.sampled_from(["flip", "cut", "empty", "remove"]))
+    @rule(
+        data=st.data(),
+        share=st.floats(0.0, 0.99),
+        how=st.sampled_from(["flip", "cut", "empty", "remove"]),
+    )
     def damage(self, data, share: float, how: str) -> None:
         """A disk changes a file."""
-        files = sorted(path for path in self.folder.rglob("*") if path.is_file() and path.name != SUMS)
+        files = sorted(
+            path for path in self.folder.rglob("*") if path.is_file() and path.name != SUMS
+        )
         if not files:
             return
         path = data.draw(st.sampled_from(files))
@@ -164,7 +187,9 @@ class FolderLife(RuleBasedStateMachine):
             path.write_bytes(content[: at * (how == "cut")])
         self.damaged = True
 
-    @precondition(lambda self: self.writer is None and not self.damaged and results_there(self.folder))
+    @precondition(
+        lambda self: self.writer is None and not self.damaged and results_there(self.folder)
+    )
     @rule()
     def collect(self) -> None:
         """A user puts together what there is."""
@@ -215,10 +240,14 @@ class FolderLife(RuleBasedStateMachine):
 
 
 def results_there(folder: Path) -> bool:
-    return (folder / results.RUNS).exists() or (folder.is_dir() and bool(results.part_indices(folder)))
+    return (folder / results.RUNS).exists() or (
+        folder.is_dir() and bool(results.part_indices(folder))
+    )
 
 
-@pytest.mark.skipif("fork" not in get_all_start_methods(), reason="copies of this process are needed")
+@pytest.mark.skipif(
+    "fork" not in get_all_start_methods(), reason="copies of this process are needed"
+)
 def test_two_processes_and_a_bad_disk_lose_no_run_of_a_batch():
     undisturbed()
     run_state_machine_as_test(FolderLife, settings=MANY)

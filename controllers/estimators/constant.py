@@ -25,7 +25,9 @@ class ConstantState(NamedTuple):
 class ConstantEstimator(Estimator[ConstantState]):
     """Ĵ(k) = Ĵ₀ at all times."""
 
-    def __init__(self, config: ConstantConfig | None = None, knowledge: RobotKnowledge | None = None) -> None:
+    def __init__(
+        self, config: ConstantConfig | None = None, knowledge: RobotKnowledge | None = None
+    ) -> None:
         """Accept the arguments of every estimator; none of them is needed."""
 
     def start(self, jacobian: FloatArray) -> ConstantState:
@@ -61,7 +63,9 @@ class TrueEstimator(Estimator[TrueState]):
             ValueError: it is not known.
         """
         if knowledge.true_jacobian is None:
-            raise ValueError("true_jacobian must be known for the estimator 'true'; this plant does not provide it")
+            raise ValueError(
+                "true_jacobian must be known for the estimator 'true'; this plant does not provide it"
+            )
         self._true_jacobian = knowledge.true_jacobian
 
     def start(self, jacobian: FloatArray) -> TrueState:

@@ -19,7 +19,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, cholesky_of, joseph, symmetric
+from servobench.controllers.estimators.kalman import (
+    RandomWalk,
+    RandomWalkEstimator,
+    cholesky_of,
+    joseph,
+    symmetric,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, outer, repeat
 from servobench.plant.contract.settings import Count, Positive, settings
@@ -37,7 +43,9 @@ def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
 def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> FloatArray:
     """Return |e|^(α−2) exp(−|e/β|^α), above 0, for normalised errors of any shape."""
     size = np.maximum(np.abs(error), MIN_ERROR)
-    return np.asarray(size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)))
+    return np.asarray(
+        size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT))
+    )
 
 
 def weighted_gain(
@@ -50,7 +58,13 @@ def weighted_gain(
 
 
 def corrected(
-    J: FloatArray, P: FloatArray, gain: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
+    J: FloatArray,
+    P: FloatArray,
+    gain: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    r: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form."""
     dq = joint_step[..., None, :]
@@ -125,7 +139,9 @@ def fixed_point_update(
 
     given: tuple[FloatArray, ...] = J, B, h, joint_step, feature_step, r
 
-    def improved(tree: tuple[Iterate, tuple[FloatArray, ...]]) -> tuple[Iterate, tuple[FloatArray, ...]]:
+    def improved(
+        tree: tuple[Iterate, tuple[FloatArray, ...]],
+    ) -> tuple[Iterate, tuple[FloatArray, ...]]:
         at, (J, B, h, dq, dy, r) = tree
         error = (dy - np.matvec(at.J, dq)) / np.sqrt(r)[..., None]
         spread, w = h / weight(at.prior), weight(error)
@@ -134,14 +150,18 @@ def fixed_point_update(
         nu = dy - np.matvec(J, dq)
         new = J + nu[..., None] * gain
         change, size = (norm(each.reshape(*each.shape[:-2], -1)) for each in (new - at.J, at.J))
-        return Iterate(new, gain, -(share * nu)[..., None] * spread, change > config.tolerance * size), tree[1]
+        return Iterate(
+            new, gain, -(share * nu)[..., None] * spread, change > config.tolerance * size
+        ), tree[1]
 
     at = Iterate(J, np.zeros_like(J), np.zeros_like(J), np.ones_like(r, dtype=np.bool_)[()])
     at, _ = repeat(lambda tree: tree[0].moves, improved, (at, given), config.iterations)
     return corrected(J, P, at.gain, joint_step, feature_step, r=r)
 
 
-def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def mckf_estimator(
+    config: MckfConfig, knowledge: RobotKnowledge | None = None
+) -> RandomWalkEstimator:
     """Return the maximum correntropy Kalman filter (MCKF); nothing about the robot is needed.
 
     Chen, Liu, Zhao and Príncipe, "Maximum correntropy Kalman filter", Automatica 76 (2017) 70-77: the sum of the
@@ -153,10 +173,14 @@ def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) 
     until x stays. Then P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ. Ren and Li applied it to visual servoing.
     """
     weight = partial(gaussian_weight, bandwidth=config.bandwidth)
-    return RandomWalkEstimator(config, partial(fixed_point_update, weight=weight, config=config), "by_rows")
+    return RandomWalkEstimator(
+        config, partial(fixed_point_update, weight=weight, config=config), "by_rows"
+    )
 
 
-def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def gmckf_estimator(
+    config: GmckfConfig, knowledge: RobotKnowledge | None = None
+) -> RandomWalkEstimator:
     """Return the generalised maximum correntropy Kalman filter (GMCKF); nothing about the robot is needed.
 
     Mo, Wang, Yang, Chen, Li and Jiang, "Generalized Maximum Correntropy Kalman Filter for Target Tracking in TianGong-2
@@ -170,7 +194,9 @@ def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None
     `MIN_ERROR`. The paper's choice of α by an estimate of the kurtosis is left out; α is a setting.
     """
     weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
-    return RandomWalkEstimator(config, partial(fixed_point_update, weight=weight, config=config), "by_rows")
+    return RandomWalkEstimator(
+        config, partial(fixed_point_update, weight=weight, config=config), "by_rows"
+    )
 
 
 @settings
@@ -182,7 +208,13 @@ class ImcckfConfig(RandomWalk):
 
 
 def imcckf_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, bandwidth: float
+    J: FloatArray,
+    P: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    r: FloatArray,
+    bandwidth: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
@@ -191,7 +223,9 @@ def imcckf_update(
     return J + innovation[..., None] * gain, symmetric(P - outer(gain, PH))
 
 
-def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def imcckf_estimator(
+    config: ImcckfConfig, knowledge: RobotKnowledge | None = None
+) -> RandomWalkEstimator:
     """Return the improved maximum correntropy criterion Kalman filter; nothing about the robot is needed.
 
     Kulikova, "Square-root algorithms for maximum correntropy estimation of linear discrete-time systems in presence of
@@ -200,7 +234,9 @@ def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = No
 
         λ = G(‖Δy − H x⁻‖_R⁻¹),   K = λ P⁻ Hᵀ (λ H P⁻ Hᵀ + R)⁻¹,   x = x⁻ + K (Δy − H x⁻),   P = (I − K H) P⁻
     """
-    return RandomWalkEstimator(config, partial(imcckf_update, bandwidth=config.bandwidth), "by_rows")
+    return RandomWalkEstimator(
+        config, partial(imcckf_update, bandwidth=config.bandwidth), "by_rows"
+    )
 
 
 @settings
@@ -214,16 +250,26 @@ class RmckfConfig(RandomWalk):
 
 
 def rmckf_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, r: FloatArray, config: RmckfConfig
+    J: FloatArray,
+    P: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    r: FloatArray,
+    config: RmckfConfig,
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
-    weight = gaussian_weight(innovation / np.sqrt(r)[..., None], config.bandwidth) + config.regularisation
+    weight = (
+        gaussian_weight(innovation / np.sqrt(r)[..., None], config.bandwidth)
+        + config.regularisation
+    )
     _, gain = weighted_gain(P, joint_step, weight, r)
     return corrected(J, P, gain, joint_step, feature_step, r=r)
 
 
-def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def rmckf_estimator(
+    config: RmckfConfig, knowledge: RobotKnowledge | None = None
+) -> RandomWalkEstimator:
     """Return the regularised maximum correntropy criterion Kalman filter; nothing about the robot is needed.
 
     Leite, Araújo and Martins, "Regularized Maximum Correntropy Criterion Kalman Filter for Uncalibrated Visual Servoing

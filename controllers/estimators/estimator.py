@@ -13,7 +13,9 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm
 
 State = TypeVar("State")
-MOTION_TIME: Final = 0.05  # [s] shortest motion at any control period, so that as much is learned per second
+MOTION_TIME: Final = (
+    0.05  # [s] shortest motion at any control period, so that as much is learned per second
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -57,7 +59,9 @@ class Estimator(ABC, Generic[State]):
         jacobian: FloatArray = one_matrix.J
         return jacobian
 
-    def deviation(self, state: State, first: State | None, joint_position: FloatArray) -> FloatArray:
+    def deviation(
+        self, state: State, first: State | None, joint_position: FloatArray
+    ) -> FloatArray:
         """Return Ĵ − Ĵ_first at `joint_position` (..., n), rad; Ĵ where there is no first state."""
         jacobian = self.jacobian(state, joint_position)
         return jacobian if first is None else jacobian - self.jacobian(first, joint_position)

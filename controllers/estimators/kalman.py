@@ -39,7 +39,13 @@ from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import outer, plus_diagonal
-from servobench.plant.contract.settings import Deviation, NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.settings import (
+    Deviation,
+    NonNegative,
+    Positive,
+    PositiveOrInfinite,
+    settings,
+)
 from servobench.plant.contract.signals import BoolArray
 
 
@@ -75,13 +81,19 @@ def cholesky_of(P: FloatArray) -> FloatArray:
         L = np.asarray(np.linalg.cholesky(P))
     except np.linalg.LinAlgError as error:
         lowest = float(np.linalg.eigvalsh(P).min())
-        raise FilterDiverged(f"covariance is not positive definite: smallest eigenvalue {lowest:.3e}") from error
+        raise FilterDiverged(
+            f"covariance is not positive definite: smallest eigenvalue {lowest:.3e}"
+        ) from error
     if not is_finite(L):  # LAPACK lets NaN pass
-        raise FilterDiverged(f"covariance is not finite: diagonal {np.diagonal(P, axis1=-2, axis2=-1).tolist()}")
+        raise FilterDiverged(
+            f"covariance is not finite: diagonal {np.diagonal(P, axis1=-2, axis2=-1).tolist()}"
+        )
     return L
 
 
-def joseph(P: FloatArray, PH: FloatArray, K: FloatArray, joint_step: FloatArray, r: FloatArray) -> FloatArray:
+def joseph(
+    P: FloatArray, PH: FloatArray, K: FloatArray, joint_step: FloatArray, r: FloatArray
+) -> FloatArray:
     """Return (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ, (..., n, n), for PH = PΔq, K and Δq, (..., n), and r, (...).
 
     With A = P − K PHᵀ it is multiplied out: A − (A Δq) Kᵀ + r K Kᵀ.
@@ -111,7 +123,10 @@ def kalman_update(
         The new Jacobian and covariance.
     """
     *lead, m, n = J.shape
-    x, H = J.reshape(*lead, m * n), (np.eye(m)[..., None] * joint_step[..., None, None, :]).reshape(*lead, m, m * n)
+    x, H = (
+        J.reshape(*lead, m * n),
+        (np.eye(m)[..., None] * joint_step[..., None, None, :]).reshape(*lead, m, m * n),
+    )
     HP, R = H @ P, r[..., None, None] * np.eye(m)
     K = np.linalg.solve(HP @ H.mT + R, HP).mT
     A = np.eye(m * n) - K @ H
@@ -128,7 +143,9 @@ def split_update(
     """
     PH = np.matvec(P, joint_step)
     K = PH / (np.vecdot(joint_step, PH) + r)[..., None]
-    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(joseph(P, PH, K, joint_step, r))
+    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(
+        joseph(P, PH, K, joint_step, r)
+    )
 
 
 Update: TypeAlias = Callable[..., tuple[FloatArray, FloatArray]]
@@ -172,7 +189,9 @@ class RandomWalkEstimator(GatedEstimator[WalkState]):
         walk, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
         if r.ndim < walk.ndim:
             r = np.broadcast_to(r, walk.shape)
-        P = plus_diagonal(state.P, walk[..., None, None] if self._covariance == "by_rows" else walk[..., None])
+        P = plus_diagonal(
+            state.P, walk[..., None, None] if self._covariance == "by_rows" else walk[..., None]
+        )
         J, P = self._formula(state.J, P, motion.joint_step, motion.feature_step, r=r)
         cholesky_of(P)
         return state._replace(J=J, P=P)
@@ -182,10 +201,15 @@ class RandomWalkEstimator(GatedEstimator[WalkState]):
         trace: FloatArray = state.P.trace(axis1=-2, axis2=-1)
         if self._covariance == "by_rows":
             trace = trace.mean(axis=-1)
-        return {"estimator_updated": state.updated, "jacobian_deviation": np.sqrt(trace / state.P.shape[-1])}
+        return {
+            "estimator_updated": state.updated,
+            "jacobian_deviation": np.sqrt(trace / state.P.shape[-1]),
+        }
 
 
-def kalman_estimator(config: KalmanConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def kalman_estimator(
+    config: KalmanConfig, knowledge: RobotKnowledge | None = None
+) -> RandomWalkEstimator:
     """Return the Kalman filter: x ← x + K (Δy − H x), K = P Hᵀ (H P Hᵀ + R)⁻¹, P in Joseph form.
 
     Nothing about the robot is needed.
@@ -229,7 +253,13 @@ def sigma_weights(size: int, alpha: float, beta: float, kappa: float) -> SigmaWe
 
 
 def unscented_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, config: UkfConfig
+    J: FloatArray,
+    P: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    r: FloatArray,
+    config: UkfConfig,
 ) -> tuple[FloatArray, FloatArray]:
     """Correct vec(J) by one motion with sigma points; see `kalman_update`.
 
@@ -249,7 +279,8 @@ def unscented_update(
     reach = weights.reach * cholesky_of(P).mT
     offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
-    Z = np.matvec(points.reshape(*lead, 2 * size + 1, m, n), joint_step[..., None, :])  # a point is m rows of J
+    # A point is m rows of J
+    Z = np.matvec(points.reshape(*lead, 2 * size + 1, m, n), joint_step[..., None, :])
     z = np.vecmat(weights.mean, Z)
     deviations = Z - z[..., None, :]
     weighted = weights.covariance[:, None] * deviations
@@ -260,7 +291,9 @@ def unscented_update(
     return J + np.matvec(K, feature_step - z).reshape(J.shape), symmetric(P)
 
 
-def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def ukf_estimator(
+    config: UkfConfig, knowledge: RobotKnowledge | None = None
+) -> RandomWalkEstimator:
     """Return the random-walk estimator whose gain is that of the unscented transform.
 
     The paper gives neither P₀, Q and R nor a rule for an arm at rest; here R is the variance 2σ² of the feature's
@@ -288,11 +321,18 @@ class RlsConfig:
         """Check across fields."""
         limit, least = self.covariance_limit, self.initial_covariance
         if limit < least:
-            raise ValueError(f"covariance_limit must be at least initial_covariance = {least:g}, got {limit:g}")
+            raise ValueError(
+                f"covariance_limit must be at least initial_covariance = {least:g}, got {limit:g}"
+            )
 
 
 def rls_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, forgetting: FloatArray
+    J: FloatArray,
+    P: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    forgetting: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, P in Joseph form.
 
@@ -330,7 +370,13 @@ class RlsEstimator(GatedEstimator[WalkState]):
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
-        J, P = rls_update(state.J, state.P, dq, dy, forgetting=np.exp(-np.asarray(motion.duration) / config.memory))
+        J, P = rls_update(
+            state.J,
+            state.P,
+            dq,
+            dy,
+            forgetting=np.exp(-np.asarray(motion.duration) / config.memory),
+        )
         P = P * np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))[..., None, None]
         cholesky_of(P)
         return state._replace(J=J, P=P)

@@ -51,7 +51,12 @@ class CfdlConfig:
 
 
 def projection_update(
-    J: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, step_factor: float, regularisation: float
+    J: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    step_factor: float,
+    regularisation: float,
 ) -> FloatArray:
     """Return J + η (Δy − JΔq) Δqᵀ / (μ + ‖Δq‖²); Broyden's update for μ = 0, the compact-form one for μ > 0.
 
@@ -97,7 +102,9 @@ class ProjectionEstimator(GatedEstimator[ProjectionState]):
     def _correct(self, state: ProjectionState, motion: Motion) -> ProjectionState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
         regularisation = config.regularisation if isinstance(config, CfdlConfig) else 0.0
-        J = projection_update(state.J, dq, dy, step_factor=config.step_factor, regularisation=regularisation)
+        J = projection_update(
+            state.J, dq, dy, step_factor=config.step_factor, regularisation=regularisation
+        )
         state = state._replace(J=J)
         if isinstance(config, BroydenConfig) or not config.reset:
             return state

@@ -36,7 +36,11 @@ class RbfConfig:
 
 
 def window_step(
-    sizes: FloatArray, joint_steps: FloatArray, count: npt.NDArray[np.int_], k2: float, epsilon: npt.ArrayLike
+    sizes: FloatArray,
+    joint_steps: FloatArray,
+    count: npt.NDArray[np.int_],
+    k2: float,
+    epsilon: npt.ArrayLike,
 ) -> FloatArray:
     """Return α₂ = k₂ / (ε ‖θ‖² + Σ_t Σ_i Δq²_{i,t} ‖θ_i(q_t)‖²) (eq. 36 with ε), (...); 0 where nothing has moved.
 
@@ -109,7 +113,9 @@ class NetworkEstimator(Estimator[NetworkState]):
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
         return self._with_rows(state.rows, joint_position)
 
-    def deviation(self, state: NetworkState, first: NetworkState | None, joint_position: FloatArray) -> FloatArray:
+    def deviation(
+        self, state: NetworkState, first: NetworkState | None, joint_position: FloatArray
+    ) -> FloatArray:
         """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
         if first is None:
             return self.jacobian(state, joint_position)
@@ -120,7 +126,10 @@ class NetworkEstimator(Estimator[NetworkState]):
     def _with_rows(self, rows: FloatArray, q: FloatArray) -> FloatArray:
         theta = self.features(q)
         if rows is not self._rows:
-            self._jacobian, self._rows = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :], rows
+            self._jacobian, self._rows = (
+                self._network.output(rows, theta[..., None, :, :])[..., 0, :, :],
+                rows,
+            )
         return self._jacobian
 
 
@@ -147,7 +156,11 @@ class RbfEstimator(NetworkEstimator[RbfState]):
 
     def start(self, jacobian: FloatArray) -> RbfState:
         """Start from the offline network, without regard to Ĵ₀."""
-        lead, window, (layers, units) = jacobian.shape[:-2], self._config.window, self._network.layers
+        lead, window, (layers, units) = (
+            jacobian.shape[:-2],
+            self._config.window,
+            self._network.layers,
+        )
         return RbfState(
             rows=self._started(jacobian),
             theta=np.zeros((*lead, window - 1, layers, units)),
@@ -165,9 +178,13 @@ class RbfEstimator(NetworkEstimator[RbfState]):
         if motion.noise is not None:
             ratio = motion.noise / REFERENCE_NOISE
             epsilon = epsilon * (ratio * ratio)
-        theta = np.concatenate([state.theta, self.features(motion.joint_position)[..., None, :, :]], axis=-3)
+        theta = np.concatenate(
+            [state.theta, self.features(motion.joint_position)[..., None, :, :]], axis=-3
+        )
         joint_steps = np.concatenate([state.joint_steps, motion.joint_step[..., None, :]], axis=-2)
-        feature_steps = np.concatenate([state.feature_steps, motion.feature_step[..., None, :]], axis=-2)
+        feature_steps = np.concatenate(
+            [state.feature_steps, motion.feature_step[..., None, :]], axis=-2
+        )
         errors = feature_steps - np.matvec(network.output(state.rows, theta), joint_steps)
         filled = np.minimum(state.filled + 1, config.window)
         sizes = np.vecdot(theta, theta).take(network.layer_of, axis=-1)
@@ -225,7 +242,11 @@ class RbfLyapunovEstimator(NetworkEstimator[RbfLyapunovState]):
 
     def update(self, state: RbfLyapunovState, motion: Motion) -> RbfLyapunovState:
         """Learn from one motion."""
-        q, dq, theta = motion.joint_position, motion.joint_step[..., None, :], self.features(motion.joint_position)
+        q, dq, theta = (
+            motion.joint_position,
+            motion.joint_step[..., None, :],
+            self.features(motion.joint_position),
+        )
         unexplained = motion.feature_step - np.matvec(self.jacobian(state, q), motion.joint_step)
         s = unexplained / np.asarray(motion.duration)[..., None]
         pull = self._config.n3 * s - self._config.n2 * motion.error

@@ -97,7 +97,9 @@ class RobustEstimator(Estimator[RobustState]):
     def start(self, jacobian: FloatArray) -> RobustState:
         """Start from Ĵ₀, (..., m, n), m/rad, and the first measurement of the feature."""
         config, (*lead, m, n) = self._config, jacobian.shape
-        variances = np.concatenate([[config.feature_noise**2], np.full(n, config.initial_deviation**2)])
+        variances = np.concatenate(
+            [[config.feature_noise**2], np.full(n, config.initial_deviation**2)]
+        )
         P = np.broadcast_to(np.diag(variances), (*lead, m, n + 1, n + 1))
         zero = np.zeros((*lead, m))
         return RobustState(jacobian, P, zero, np.ones(lead)[()], zero)
@@ -115,7 +117,10 @@ class RobustEstimator(Estimator[RobustState]):
         P = self._predicted(state.P, motion.joint_step, predicted, duration)
         cholesky_of(P)
         column, deviation = P[..., 0], sigma * state.scale
-        variance, noise = column[..., 0], (deviation * deviation)[..., None] * np.ones_like(innovation)
+        variance, noise = (
+            column[..., 0],
+            (deviation * deviation)[..., None] * np.ones_like(innovation),
+        )
         weight = irls_weight(innovation, variance, noise)
         gain = weight[..., None] * column / (weight * variance + noise)[..., None]
         J = state.J + innovation[..., None] * gain[..., 1:]
@@ -124,7 +129,9 @@ class RobustEstimator(Estimator[RobustState]):
         rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTION_WEIGHT)
         lost = rejected > LOST_SHARE
         P = where(lost, _restarted_at_frame(P, noise), (P + P.mT) / 2)
-        excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(axis=-1)
+        excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(
+            axis=-1
+        )
         scale = np.clip(state.scale * np.exp(SCALE_RATE * duration * excess), 1.0, MAX_SCALE)
         deviation, none = innovation * (1.0 - gain[..., 0]), np.zeros_like(innovation)
         return RobustState(J, P, where(lost, none, deviation), scale, where(lost, none, rejected))

@@ -29,7 +29,9 @@ class Law(ABC, Generic[State]):
     # the stages of the chain that the law brings itself, so that a controller may not add another one; "preview": it
     # looks at more of the reference than the present row
     owns: frozenset[Stage] = frozenset()
-    in_model_frame: bool = False  # whether it was trained on the nominal model, so that it works in that model's frame
+    in_model_frame: bool = (
+        False  # whether it was trained on the nominal model, so that it works in that model's frame
+    )
 
     @abstractmethod
     def start(self, observation: Observation) -> State:
@@ -55,7 +57,9 @@ class Law(ABC, Generic[State]):
             RunFault: it cannot go on in at least one lane.
         """
 
-    def restrained(self, state: State, wanted: FloatArray, joint_velocity: FloatArray) -> FloatArray:
+    def restrained(
+        self, state: State, wanted: FloatArray, joint_velocity: FloatArray
+    ) -> FloatArray:
         """Return the velocity to send, (..., n), rad/s; a law that limits the change of its commands overrides this.
 
         Args:

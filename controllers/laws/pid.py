@@ -67,8 +67,17 @@ class PidLaw(Law[PidState]):
 
     def start(self, observation: Observation) -> PidState:
         """Return zero integral and derivative."""
-        zero, never = np.zeros(observation.feature.shape), np.full(observation.feature.shape[:-1], np.inf)
-        return PidState(integral=zero, derivative=zero, last_error=zero, integral_before=zero, since_feature=never)
+        zero, never = (
+            np.zeros(observation.feature.shape),
+            np.full(observation.feature.shape[:-1], np.inf),
+        )
+        return PidState(
+            integral=zero,
+            derivative=zero,
+            last_error=zero,
+            integral_before=zero,
+            since_feature=never,
+        )
 
     def command(
         self, state: PidState, estimate: Estimate, observation: Observation, reference: FloatArray
@@ -76,16 +85,24 @@ class PidLaw(Law[PidState]):
         """Return the new state and u, (..., n), rad/s; see `Law.command`."""
         config = self._config
         e = reference[..., 0, :] - observation.feature
-        state = state._replace(integral_before=state.integral, since_feature=state.since_feature + self._dt)
+        state = state._replace(
+            integral_before=state.integral, since_feature=state.since_feature + self._dt
+        )
         state = branch(observation.feature_valid, self._learn, state, e)
-        v = self._rate * e + config.integral_gain * state.integral + config.derivative_gain * state.derivative
+        v = (
+            self._rate * e
+            + config.integral_gain * state.integral
+            + config.derivative_gain * state.derivative
+        )
         return state, np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
 
     def noted(self, state: PidState, joint_velocity: FloatArray, limited: BoolArray) -> PidState:
         """Hold an integral that grows while the command is limited."""
         integral, before = state.integral, state.integral_before
         winds_up = limited & (np.vecdot(integral, integral) >= np.vecdot(before, before))
-        return branch(winds_up, lambda winding: winding._replace(integral=winding.integral_before), state)
+        return branch(
+            winds_up, lambda winding: winding._replace(integral=winding.integral_before), state
+        )
 
     def diagnostics(self, state: PidState) -> Diagnostics:
         """Return the norm of the integral, m s."""
@@ -96,4 +113,6 @@ class PidLaw(Law[PidState]):
         tau, passed = self._config.derivative_filter, state.since_feature
         derivative = (tau * state.derivative + e - state.last_error) / (tau + passed)[..., None]
         integral = state.integral + self._dt * e
-        return PidState(integral, derivative, e, state.integral_before, since_feature=np.zeros_like(passed))
+        return PidState(
+            integral, derivative, e, state.integral_before, since_feature=np.zeros_like(passed)
+        )

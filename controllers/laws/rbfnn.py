@@ -21,7 +21,11 @@ from servobench.controllers.algebra import project_to_row_space
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
+from servobench.controllers.networks.rbf import (
+    ControllerNetwork,
+    controller_output,
+    information_vector,
+)
 from servobench.controllers.periods import check_preview, in_periods, sampled
 from servobench.controllers.stages.finish import largest_excess
 from servobench.controllers.stages.prediction import pushed
@@ -67,7 +71,8 @@ def roll_out(
     A = np.broadcast_to(_shift(m, n, *lengths), (*lead, p, p + n + m)).copy()
     A[..., :m, p : p + n] = -jacobian
     states, hs = np.empty((*lead, horizon + 1, p + n + m)), np.empty((*lead, horizon, hidden))
-    xis = states[..., :p]  # a state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ
+    # A state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ
+    xis = states[..., :p]
     xis[..., 0, :], states[..., :-1, p + n :] = information_vector(*history), reference_steps
     reach, wanted = 1.0 / step_limit, np.zeros((*lead, n))
     for t in range(horizon):
@@ -187,7 +192,9 @@ class RbfnnLaw(Law[RbfnnState]):
 
     in_model_frame = True
 
-    def __init__(self, config: RbfnnConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
+    def __init__(
+        self, config: RbfnnConfig, knowledge: RobotKnowledge, networks: TrainedNetworks
+    ) -> None:
         """Take the settings, the offline networks, limits, period and preview.
 
         Raises:
@@ -195,7 +202,9 @@ class RbfnnLaw(Law[RbfnnState]):
         """
         spec, network = knowledge.spec, replace(networks.controller, offset_free=config.offset_free)
         if config.preview:
-            check_preview(config.horizon * network.step, knowledge.preview, spec.period, "the law's horizon")
+            check_preview(
+                config.horizon * network.step, knowledge.preview, spec.period, "the law's horizon"
+            )
         self._config = config
         self._network = network
         self.owns = frozenset({"preview"}) if config.preview else frozenset()
@@ -206,7 +215,10 @@ class RbfnnLaw(Law[RbfnnState]):
         self._preview_places = rate * np.arange(config.horizon + 1.0)
         self._error_places = rate * np.arange(float(network.error_history))
         self._position_places = rate * np.arange(float(network.position_history))
-        self._rows = [1 + math.ceil(float(places[-1])) for places in (self._error_places, self._position_places)]
+        self._rows = [
+            1 + math.ceil(float(places[-1]))
+            for places in (self._error_places, self._position_places)
+        ]
 
     def start(self, observation: Observation) -> RbfnnState:
         """Return the state of the offline network."""
@@ -227,7 +239,9 @@ class RbfnnLaw(Law[RbfnnState]):
         config, jacobian, learned = self._config, estimate.jacobian, state.learned
         errors = pushed(state.errors, reference[..., 0, :] - observation.feature)
         begins = np.isnan(errors[..., -1, 0])  # the first error fills its history
-        errors = branch(begins, lambda first: np.repeat(first[..., :1, :], self._rows[0], axis=-2), errors)
+        errors = branch(
+            begins, lambda first: np.repeat(first[..., :1, :], self._rows[0], axis=-2), errors
+        )
         positions = state.positions
         if config.position == "measured":
             positions = pushed(positions, observation.joint_position)
@@ -239,12 +253,15 @@ class RbfnnLaw(Law[RbfnnState]):
         direction = descent_direction(jacobian, ahead)
         alpha, wanted = self._update(direction, ahead, observation.feature_valid)
         direction *= alpha[..., None, None, None]
-        learned = np.add(learned, direction, out=direction)  # weights are large: no array more than is needed
+        # Weights are large: no array more than is needed
+        learned = np.add(learned, direction, out=direction)
         alpha = np.where(observation.feature_valid, alpha, state.step_size)[()]
         new = RbfnnState(learned, errors, positions, ahead.errors, alpha)
         return new, wanted / self._step
 
-    def noted(self, state: RbfnnState, joint_velocity: FloatArray, limited: BoolArray) -> RbfnnState:
+    def noted(
+        self, state: RbfnnState, joint_velocity: FloatArray, limited: BoolArray
+    ) -> RbfnnState:
         """Return the state with the step that is sent among the commanded positions; see `Law.noted`."""
         if self._config.position == "measured":
             return state
@@ -257,7 +274,9 @@ class RbfnnLaw(Law[RbfnnState]):
             "criterion": 0.5 * sum_of_squares(state.predicted, 2),
             "step_size": state.step_size,
             "predicted_error": norm(state.predicted[..., -1, :]),
-            "controller_weight_norm": np.sqrt(sum_of_squares(self._network.weights + state.learned, 3)),
+            "controller_weight_norm": np.sqrt(
+                sum_of_squares(self._network.weights + state.learned, 3)
+            ),
             "learned_weight_norm": np.sqrt(sum_of_squares(state.learned, 3)),
         }
 
@@ -269,7 +288,9 @@ class RbfnnLaw(Law[RbfnnState]):
         rows = sampled(reference, self._preview_places)
         return np.asarray(rows[..., 1:, :] - rows[..., :-1, :])
 
-    def _update(self, direction: FloatArray, ahead: RollOut, valid: bool | BoolArray) -> tuple[FloatArray, FloatArray]:
+    def _update(
+        self, direction: FloatArray, ahead: RollOut, valid: bool | BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return α, (...), and the joint step of the weights with the update α G, (..., n), rad.
 
         α is 0 without a valid feature. Anti-windup: where the old weights exceed the limit, an update that exceeds it
@@ -280,7 +301,9 @@ class RbfnnLaw(Law[RbfnnState]):
         if self._config.anti_windup:
             renewed = ahead.wanted + alpha[..., None] * push
             before = largest_excess(ahead.wanted, self._step_limit)
-            alpha = alpha * ((before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before))
+            alpha = alpha * (
+                (before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before)
+            )
         return alpha, ahead.wanted + alpha[..., None] * push
 
 

@@ -6,7 +6,15 @@ from annotated_types import Ge, Len, Lt
 
 from servobench.controllers.networks.rbf import STEP, Kernel
 from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.contract.settings import Count, NonNegative, Number, Periods, Positive, nested, settings
+from servobench.plant.contract.settings import (
+    Count,
+    NonNegative,
+    Number,
+    Periods,
+    Positive,
+    nested,
+    settings,
+)
 
 Placement = Literal["halton", "sobol", "kmeans"]
 Grid: TypeAlias = Annotated[tuple[Positive, ...], Len(1)]
@@ -31,7 +39,9 @@ class JacobianTraining:
     def __post_init__(self) -> None:
         """Check across fields."""
         if self.samples < self.centres:
-            raise ValueError(f"samples must be at least the {self.centres} centres, got {self.samples}")
+            raise ValueError(
+                f"samples must be at least the {self.centres} centres, got {self.samples}"
+            )
 
 
 @settings
@@ -70,7 +80,9 @@ class ControllerTraining:
     def __post_init__(self) -> None:
         """Check across fields."""
         if self.samples < self.hidden:
-            raise ValueError(f"samples must be at least the {self.hidden} hidden units, got {self.samples}")
+            raise ValueError(
+                f"samples must be at least the {self.hidden} hidden units, got {self.samples}"
+            )
 
 
 @settings
@@ -93,12 +105,18 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         """Check across fields."""
         if len(self.lower) != len(self.upper):
-            raise ValueError(f"lower and upper must be equally long, got {len(self.lower)} and {len(self.upper)}")
+            raise ValueError(
+                f"lower and upper must be equally long, got {len(self.lower)} and {len(self.upper)}"
+            )
         if any(low >= high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(f"lower must be below upper for every joint, got {self.lower} and {self.upper}")
+            raise ValueError(
+                f"lower must be below upper for every joint, got {self.lower} and {self.upper}"
+            )
         fewest = min(self.jacobian.samples, self.controller.samples)
         if round(fewest * self.held_out) == fewest:
-            raise ValueError(f"held_out leaves none of {fewest} samples for the fit, got {self.held_out:g}")
+            raise ValueError(
+                f"held_out leaves none of {fewest} samples for the fit, got {self.held_out:g}"
+            )
 
     def region(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the box, two arrays (n,) [rad].

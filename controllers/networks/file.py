@@ -16,7 +16,9 @@ from servobench.plant.contract.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 2
-MAX_UNPACKED = 256_000_000  # [bytes] sum of all arrays; trained networks have less than a hundredth of it
+MAX_UNPACKED = (
+    256_000_000  # [bytes] sum of all arrays; trained networks have less than a hundredth of it
+)
 READ_ERRORS = (  # exceptions of numpy's reader for a damaged file, or one that is no .npz
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, NotImplementedError, OSError, RuntimeError,
     SyntaxError, TypeError, ValueError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
@@ -38,7 +40,9 @@ class TrainedNetworks:
         """Check that both networks are of the same robot."""
         one, other = ((network.n, network.m) for network in (self.jacobian, self.controller))
         if one != other:
-            raise ValueError(f"both networks must have the same sizes (n, m), got {one} and {other}")
+            raise ValueError(
+                f"both networks must have the same sizes (n, m), got {one} and {other}"
+            )
 
 
 def save_networks(networks: TrainedNetworks, path: Path) -> None:
@@ -84,17 +88,23 @@ def _read_arrays(path: Path) -> dict[str, Any]:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             unpacked = sum(entry.file_size for entry in archive.zip.infolist())
             if unpacked > MAX_UNPACKED:
-                raise ValueError(f"it unpacks to {unpacked:,} bytes, at most {MAX_UNPACKED:,} are read")
+                raise ValueError(
+                    f"it unpacks to {unpacked:,} bytes, at most {MAX_UNPACKED:,} are read"
+                )
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise ValueError(f"network file {path} does not exist") from error
     except READ_ERRORS as error:
-        raise ValueError(f"network file {path} is corrupt or not a network file: {error}") from error
+        raise ValueError(
+            f"network file {path} is corrupt or not a network file: {error}"
+        ) from error
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"network file {path} is not a network file of servobench")
     version = str(arrays.get("format_version"))
     if version != str(FORMAT_VERSION):
-        raise ValueError(f"network file {path} has format version {version}, wanted {FORMAT_VERSION}; train it again")
+        raise ValueError(
+            f"network file {path} has format version {version}, wanted {FORMAT_VERSION}; train it again"
+        )
     return arrays
 
 
@@ -119,9 +129,15 @@ def _from_arrays(arrays: dict[str, Any]) -> TrainedNetworks:
     jacobian_error, controller_error = (float(value) for value in arrays["held_out_error"])
     jacobian = JacobianNetwork(*(arrays[f"jacobian_{name}"] for name in ARRAYS))
     if tuple(arrays["sizes"].tolist()) != (jacobian.n, jacobian.m):
-        raise ValueError(f"sizes must be {(jacobian.n, jacobian.m)}, got {arrays['sizes'].tolist()}")
+        raise ValueError(
+            f"sizes must be {(jacobian.n, jacobian.m)}, got {arrays['sizes'].tolist()}"
+        )
     centres, widths, weights = (arrays[f"controller_{name}"] for name in ARRAYS)
     kernel = cast(Kernel, str(arrays["kernel"]))
     step = float(arrays["step"])
-    controller = ControllerNetwork(centres, widths, weights, error_history, position_history, kernel, step)
-    return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, str(arrays["digest"]))
+    controller = ControllerNetwork(
+        centres, widths, weights, error_history, position_history, kernel, step
+    )
+    return TrainedNetworks(
+        jacobian, controller, jacobian_error, controller_error, str(arrays["digest"])
+    )

@@ -28,7 +28,12 @@ import numpy as np
 from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks import rbf
-from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, Placement, TrainingConfig
+from servobench.controllers.networks.config import (
+    ControllerTraining,
+    JacobianTraining,
+    Placement,
+    TrainingConfig,
+)
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
@@ -36,12 +41,16 @@ from servobench.plant.contract.signals import PlantSpec
 Progress = Callable[[float, str], None]
 JACOBIAN_SHARE = 0.4  # [1] share of the Jacobian network in the work, for the progress bar
 DIGEST_POINTS = 16  # number of joint positions at which nominal models are compared
-DIGEST_DECIMALS = 9  # rounding, so that the last bits of another machine do not require a new training
+DIGEST_DECIMALS = (
+    9  # rounding, so that the last bits of another machine do not require a new training
+)
 MIN_SINGULAR_SHARE = 0.1  # [1] to the largest singular value of J; weaker directions are left out
 CLUSTERING_POOL = 20  # number of samples per centre for k-means
 
 
-def unit_points(count: int, dimension: int, rng: np.random.Generator, sequence: Placement = "halton") -> FloatArray:
+def unit_points(
+    count: int, dimension: int, rng: np.random.Generator, sequence: Placement = "halton"
+) -> FloatArray:
     """Return scrambled low-discrepancy points of the unit cube, (count, dimension).
 
     Args:
@@ -58,7 +67,9 @@ def unit_points(count: int, dimension: int, rng: np.random.Generator, sequence: 
     return np.asarray(qmc.Halton(dimension, seed=rng).random(count))
 
 
-def choose_centres(pool: FloatArray, count: int, rng: np.random.Generator, placement: Placement) -> FloatArray:
+def choose_centres(
+    pool: FloatArray, count: int, rng: np.random.Generator, placement: Placement
+) -> FloatArray:
     """Return `count` centres from a pool of low-discrepancy points (S, d): its first points, or its k-means.
 
     A prefix of a low-discrepancy sequence is one itself, so no distance has to be computed.
@@ -113,7 +124,9 @@ def controller_samples(
     q = lower + (upper - lower) * unit[:, :n]
     direction, magnitude = 2.0 * unit[:, n : n + m] - 1.0, unit[:, n + m : n + m + 1]
     error = plan.error_range * magnitude * direction
-    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (spec.joint_velocity_limit * plan.step)
+    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (
+        spec.joint_velocity_limit * plan.step
+    )
     back = np.concatenate([np.zeros((len(unit), 1, n)), np.cumsum(steps, axis=1)], axis=1)
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
@@ -123,14 +136,20 @@ def controller_samples(
         pinv = np.asarray(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), dtype=np.float64)
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
-    posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
+    # Ψ has no entry for a constant
+    posture_gain = plan.posture_gain if plan.fit == "output" else 0.0
     gain, posture_step = plan.gain * plan.step * pinv, posture_gain * plan.step * free
     command = q + (gain @ error[..., None])[..., 0] + posture_step
-    return ControllerSamples(rbf.information_vector(errors, positions), error, q, gain, posture_step, command)
+    return ControllerSamples(
+        rbf.information_vector(errors, positions), error, q, gain, posture_step, command
+    )
 
 
 def train(
-    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, progress: Progress | None = None
+    config: TrainingConfig,
+    nominal_jacobian: JacobianFunction,
+    spec: PlantSpec,
+    progress: Progress | None = None,
 ) -> TrainedNetworks:
     """Fit both networks on the nominal model.
 
@@ -183,11 +202,15 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
         )
     n, m = networks.jacobian.n, networks.jacobian.m
     if (n, m) != (spec.n, spec.m):
-        raise ValueError(f"network must be of {spec.n} joints and {spec.m} features, got {n} and {m}")
+        raise ValueError(
+            f"network must be of {spec.n} joints and {spec.m} features, got {n} and {m}"
+        )
     return networks
 
 
-def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> str:
+def training_digest(
+    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec
+) -> str:
     """Return a hash of all that the networks depend on: configuration, sizes, speed limit and model.
 
     Raises:
@@ -225,13 +248,17 @@ def _train_jacobian(
     for index, scale in enumerate(plan.width_scales):
         report(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
         theta = rbf.hidden_features(q, centres, np.full(plan.centres, scale * spread), "gaussian")
-        for W in ridge_path(theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations):
+        for W in ridge_path(
+            theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations
+        ):
             residual = (theta[:held] @ W).reshape(held, spec.m, spec.n) - J[:held]
             square = np.einsum("smn,smn->n", residual, residual)
             for i in np.flatnonzero(square < squares):
                 squares[i], widths[i] = square[i], scale * spread
                 weights[i] = W.reshape(plan.centres, spec.m, spec.n)[:, :, i].T
-    network = rbf.JacobianNetwork(np.broadcast_to(centres, (spec.n, *centres.shape)), widths, weights)
+    network = rbf.JacobianNetwork(
+        np.broadcast_to(centres, (spec.n, *centres.shape)), widths, weights
+    )
     return network, float(np.sqrt(squares.sum() / np.einsum("smn,smn->", J[:held], J[:held])))
 
 
@@ -252,24 +279,41 @@ def _train_controller(
     spread = float(np.sqrt(np.mean(np.sum((pool_xi - pool_xi.mean(axis=0)) ** 2, axis=-1))))
     best, network = np.inf, None
     for index, scale in enumerate(plan.width_scales):
-        report(JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales), "controller network")
+        report(
+            JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales),
+            "controller network",
+        )
         reach = scale * spread  # the distance at which a unit has fallen to 1/e
         widths = np.full(plan.hidden, reach if plan.kernel == "gaussian" else np.sqrt(reach))
         h = rbf.hidden_features(samples.xi, centres, widths, plan.kernel)
         for weights in _controller_weights(plan, samples, wanted, h, held):
             candidate = rbf.ControllerNetwork(
-                centres, widths, weights, plan.error_history, plan.position_history, plan.kernel, plan.step
+                centres,
+                widths,
+                weights,
+                plan.error_history,
+                plan.position_history,
+                plan.kernel,
+                plan.step,
             )
-            error = float(np.sqrt(np.mean((candidate.command(samples.xi[:held]) - wanted[:held]) ** 2)))
+            error = float(
+                np.sqrt(np.mean((candidate.command(samples.xi[:held]) - wanted[:held]) ** 2))
+            )
             if error < best:
                 best, network = error, candidate
     if network is None:
-        raise ValueError("the controller network could not be fitted: every held-out error is not finite")
+        raise ValueError(
+            "the controller network could not be fitted: every held-out error is not finite"
+        )
     return network, best
 
 
 def _controller_weights(
-    plan: ControllerTraining, samples: ControllerSamples, wanted: FloatArray, h: FloatArray, held: int
+    plan: ControllerTraining,
+    samples: ControllerSamples,
+    wanted: FloatArray,
+    h: FloatArray,
+    held: int,
 ) -> Iterator[FloatArray]:
     """Yield the weights W, (n, p, N_h), of each regularisation."""
     count, p = samples.xi.shape
@@ -284,7 +328,9 @@ def _controller_weights(
         yield np.moveaxis(W.reshape(plan.hidden, n, p), 0, -1)
 
 
-def ideal_controller_matrix(gain: FloatArray, error_history: int, position_history: int) -> FloatArray:
+def ideal_controller_matrix(
+    gain: FloatArray, error_history: int, position_history: int
+) -> FloatArray:
     """Return ψ* = [K_p s J⁺, 0, I, 0] (eq. 10), (S, n, m L_e + n L_c), from K_p s J⁺ (S, n, m)."""
     count, n, m = gain.shape
     psi = np.zeros((count, n, m * error_history + n * position_history))
@@ -293,7 +339,9 @@ def ideal_controller_matrix(gain: FloatArray, error_history: int, position_histo
     return psi
 
 
-def ridge_path(features: FloatArray, targets: FloatArray, regularisations: tuple[float, ...]) -> Iterator[FloatArray]:
+def ridge_path(
+    features: FloatArray, targets: FloatArray, regularisations: tuple[float, ...]
+) -> Iterator[FloatArray]:
     """Yield the ridge solutions W = (FᵀF + λ μ I)⁻¹ Fᵀ Y for each λ, with μ the largest eigenvalue of FᵀF.
 
     Args:
@@ -311,7 +359,9 @@ def ridge_path(features: FloatArray, targets: FloatArray, regularisations: tuple
 def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec) -> FloatArray:
     J = np.asarray(nominal_jacobian(q), dtype=np.float64)
     if J.shape != (len(q), spec.m, spec.n):
-        raise ValueError(f"nominal_jacobian must return {(len(q), spec.m, spec.n)} for {q.shape}, got {J.shape}")
+        raise ValueError(
+            f"nominal_jacobian must return {(len(q), spec.m, spec.n)} for {q.shape}, got {J.shape}"
+        )
     if not np.isfinite(J).all():
         raise ValueError("nominal_jacobian must be finite in the whole training region")
     return J

@@ -28,7 +28,9 @@ MAX_EXPONENT = 60.0
 MIN_EXPONENT = np.array(-MAX_EXPONENT)
 
 
-def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, kernel: Kernel) -> FloatArray:
+def hidden_features(
+    xi: FloatArray, centres: FloatArray, widths: FloatArray, kernel: Kernel
+) -> FloatArray:
     """Return the hidden layer h of the controller network (eq. 16), or θ_i of a joint column (eqs. 29, 40).
 
     Args:
@@ -46,7 +48,9 @@ def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, ker
     return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
 
 
-def _layer(x: FloatArray, kernel: Kernel, centres: FloatArray, ones: FloatArray, decay: FloatArray) -> FloatArray:
+def _layer(
+    x: FloatArray, kernel: Kernel, centres: FloatArray, ones: FloatArray, decay: FloatArray
+) -> FloatArray:
     """Return a hidden layer, (..., L), at x, (..., p), for centres (p, L), ones (p,) and the negative decay (L,)."""
     offset = x[..., :, None] - centres
     offset *= offset
@@ -92,11 +96,17 @@ class JacobianNetwork:
 
     centres: FloatArray  # c, (n, L, n), rad; `centres[i, l]` is a joint position at which unit l of column i is 1
     widths: FloatArray  # δ, (n, L), rad, positive
-    weights: FloatArray  # W, (n, m, L), m/rad; `weights[i]` maps the units of column i to the column
+    weights: (
+        FloatArray  # W, (n, m, L), m/rad; `weights[i]` maps the units of column i to the column
+    )
 
     def __post_init__(self) -> None:
         """Check that the three arrays fit together and freeze them."""
-        if self.centres.ndim != 3 or self.weights.ndim != 3 or 0 in self.centres.shape + self.weights.shape:
+        if (
+            self.centres.ndim != 3
+            or self.weights.ndim != 3
+            or 0 in self.centres.shape + self.weights.shape
+        ):
             raise ValueError(
                 "centres and weights must be (n, L, n) and (n, m, L) with all sizes at least 1, "
                 f"got {self.centres.shape} and {self.weights.shape}"
@@ -124,7 +134,9 @@ class JacobianNetwork:
         """Index of the hidden layer of each column, (n,): columns of equal centres and widths share one."""
         layers: dict[bytes, int] = {}
         columns = zip(self.centres, self.widths, strict=True)
-        return np.array([layers.setdefault(c.tobytes() + width.tobytes(), len(layers)) for c, width in columns])
+        return np.array(
+            [layers.setdefault(c.tobytes() + width.tobytes(), len(layers)) for c, width in columns]
+        )
 
     @cached_property
     def rows(self) -> FloatArray:
@@ -146,10 +158,15 @@ class JacobianNetwork:
         """
         lead, (count, layers, units) = theta.shape[:-3], theta.shape[-3:]
         # the products of each layer with each column, of which most are not wanted
-        every = theta.reshape(*lead, count * layers, units) @ rows.reshape(*rows.shape[:-3], -1, units).mT
+        every = (
+            theta.reshape(*lead, count * layers, units)
+            @ rows.reshape(*rows.shape[:-3], -1, units).mT
+        )
         return every.reshape(*lead, count, -1).take(self._places, axis=-1)
 
-    def gradient(self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray) -> FloatArray:
+    def gradient(
+        self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray
+    ) -> FloatArray:
         """Return Σ_t e_t Δq_{i,t} θ_i(q_t)ᵀ by rows of the Jacobian, (..., m, n, L): −½ ∂/∂W Σ_t ‖e_t‖² (eqs. 31, 32).
 
         Args:
@@ -166,7 +183,9 @@ class JacobianNetwork:
 
     def jacobian(self, q: FloatArray, rows: FloatArray | None = None) -> FloatArray:
         """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad, with the trained weights or with others."""
-        return self.output(self.rows if rows is None else rows, self.features(q)[..., None, :, :])[..., 0, :, :]
+        return self.output(self.rows if rows is None else rows, self.features(q)[..., None, :, :])[
+            ..., 0, :, :
+        ]
 
     @cached_property
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -174,7 +193,11 @@ class JacobianNetwork:
         _, first = np.unique(self.layer_of, return_index=True)
         centres = self.centres[first].swapaxes(-1, -2)
         shared = bool((centres == centres[0]).all())
-        return np.ascontiguousarray(centres[: 1 if shared else None]), np.ones(self.n), -1.0 / self.widths[first] ** 2
+        return (
+            np.ascontiguousarray(centres[: 1 if shared else None]),
+            np.ones(self.n),
+            -1.0 / self.widths[first] ** 2,
+        )
 
     @cached_property
     def _members(self) -> FloatArray:
@@ -207,11 +230,18 @@ class ControllerNetwork:
         if not 0.0 < self.step < np.inf:
             raise ValueError(f"step must be positive, got {self.step}")
         if self.weights.ndim != 3 or 0 in self.weights.shape:
-            raise ValueError(f"weights must be (n, p, N_h) with all sizes at least 1, got {self.weights.shape}")
+            raise ValueError(
+                f"weights must be (n, p, N_h) with all sizes at least 1, got {self.weights.shape}"
+            )
         n, p, hidden = self.weights.shape
         _freeze(self, centres=(hidden, p), widths=(hidden,), weights=(n, p, hidden))
         left = p - n * self.position_history
-        if self.error_history < 1 or self.position_history < 1 or left < 1 or left % self.error_history:
+        if (
+            self.error_history < 1
+            or self.position_history < 1
+            or left < 1
+            or left % self.error_history
+        ):
             raise ValueError(
                 f"weights must have m L_e + n L_c columns with L_e = {self.error_history}, n = {n} and "
                 f"L_c = {self.position_history}, got {p}"
@@ -245,7 +275,11 @@ class ControllerNetwork:
     @cached_property
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Centres, (p, N_h), ones, (p,), and −1/γ², (N_h,)."""
-        return np.ascontiguousarray(self.centres.T), np.ones(self.centres.shape[1]), -1.0 / self.widths**2
+        return (
+            np.ascontiguousarray(self.centres.T),
+            np.ones(self.centres.shape[1]),
+            -1.0 / self.widths**2,
+        )
 
 
 def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, ...]) -> None:

@@ -40,7 +40,9 @@ class Learned(NamedTuple):
     estimator: Any  # state of the estimator
     anchor: Any  # its state at the pair stage's anchor, which returns if later frames were false
     pair: Any  # state of the pair stage; None without one
-    unexplained: FloatArray  # ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion
+    unexplained: (
+        FloatArray  # ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion
+    )
 
 
 class EstimationState(NamedTuple):
@@ -61,7 +63,9 @@ class Estimation:
         pairing: the pair stage; None where no aid needs past joint positions.
     """
 
-    def __init__(self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays) -> None:
+    def __init__(
+        self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays
+    ) -> None:
         """Compose the stages."""
         self.estimator, self._model = estimator, aids.model
         period, self._filters = knowledge.spec.period, aids.filter
@@ -70,7 +74,11 @@ class Estimation:
         self._nominal = knowledge.nominal_jacobian
         self._uses_own = estimator.brings_model and aids.model == "own"
         shape = knowledge.spec.m, knowledge.spec.n
-        self._first = estimator.start(np.zeros(shape)) if estimator.brings_model and aids.model != "own" else None
+        self._first = (
+            estimator.start(np.zeros(shape))
+            if estimator.brings_model and aids.model != "own"
+            else None
+        )
         self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * period
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:
@@ -85,7 +93,9 @@ class Estimation:
         last = LastFrame(never, q, observation.feature, observation.valid, unknown)
         return EstimationState(Learned(estimator, estimator, pair, never), last, unknown, unknown)
 
-    def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
+    def update(
+        self, state: EstimationState, observation: Observation, desired: FloatArray
+    ) -> EstimationState:
         """Return the state at an observation; without a valid feature nothing is learned.
 
         Args:
@@ -96,26 +106,39 @@ class Estimation:
         learned, last, q = state.learned, state.last, observation.joint_position
         if self.pairing is not None:
             before = learned.pair.base
-            base = self.estimator.jacobian(learned.estimator, q) if self._uses_own else self._given(q, before)
+            base = (
+                self.estimator.jacobian(learned.estimator, q)
+                if self._uses_own
+                else self._given(q, before)
+            )
             learned = learned._replace(pair=self.pairing.advance(learned.pair, q, base))
         duration, both = observation.time - last.time, observation.valid & last.valid
         # not "duration >= shortest": that of the first frame is NaN
         due = np.logical_or.reduce(observation.valid, axis=-1) & ~(duration < self._shortest)
-        known = due & np.logical_or.reduce(both, axis=-1) & (duration > 0.0) & (duration < self._longest)
+        known = (
+            due
+            & np.logical_or.reduce(both, axis=-1)
+            & (duration > 0.0)
+            & (duration < self._longest)
+        )
         learned = branch(known, self._learn, learned, last, observation, desired, both)
         if self.pairing is not None:
             pair = branch(due & np.logical_not(known), self.pairing.interrupt, learned.pair)
             anchor = branch(pair.anchor.miss == 0.0, _other, learned.anchor, learned.estimator)
             learned = learned._replace(anchor=anchor, pair=pair)
         own = self.estimator.deviation(learned.estimator, self._first, q)
-        jacobian = own if self.pairing is None else self._with_model(own, learned, q, learned.pair.base)
+        jacobian = (
+            own if self.pairing is None else self._with_model(own, learned, q, learned.pair.base)
+        )
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
         this = LastFrame(time, q, observation.feature, observation.valid, jacobian)
         last = branch(due, lambda _, newer: newer, last, this)
         return EstimationState(learned, last, jacobian, own)
 
-    def ahead(self, state: EstimationState, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def ahead(
+        self, state: EstimationState, joint_position: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return Ĵ by the state at any joint position, (..., n) rad, and the model's J_n there, (..., m, n) each."""
         learned, q = state.learned, joint_position
         if self._uses_own:
@@ -126,7 +149,11 @@ class Estimation:
         return self._with_model(own, learned, q, nominal), nominal
 
     def motion(
-        self, state: EstimationState, begin: FloatArray, joint_step: FloatArray, predicted: FloatArray
+        self,
+        state: EstimationState,
+        begin: FloatArray,
+        joint_step: FloatArray,
+        predicted: FloatArray,
     ) -> FloatArray:
         """Return the motion of the feature, (..., m), that the state expects of one of the joints.
 
@@ -163,11 +190,18 @@ class Estimation:
         if self._model == "own" or self.pairing is None:
             return own
         if self._model == "regression":
-            nominal = self.pairing.regression.jacobian(learned.pair.regression, joint_position, nominal)
+            nominal = self.pairing.regression.jacobian(
+                learned.pair.regression, joint_position, nominal
+            )
         return nominal + own
 
     def _learn(
-        self, learned: Learned, last: LastFrame, observation: Observation, desired: FloatArray, valid: BoolArray
+        self,
+        learned: Learned,
+        last: LastFrame,
+        observation: Observation,
+        desired: FloatArray,
+        valid: BoolArray,
     ) -> Learned:
         """Learn from a motion; features that were not `valid` at both ends are taken to move as predicted."""
         error, pairing, noise = desired - observation.feature, self.pairing, None
@@ -177,12 +211,16 @@ class Estimation:
         if pairing is not None:
             pair, paired = pairing.learn(pair, dy, duration, valid)
             dy, duration, valid, q, step, x, h, before, back = paired
-            learned = learned._replace(estimator=branch(back, _other, learned.estimator, learned.anchor))
+            learned = learned._replace(
+                estimator=branch(back, _other, learned.estimator, learned.anchor)
+            )
             noise = pairing.noise(pair)
             if self._filters:
                 dy = dy - (pair.regression.mean[..., -1] - before.mean[..., -1])
             if self._model != "own":
-                explained = x if self._model == "nominal" else pairing.regression.explained(before, h)
+                explained = (
+                    x if self._model == "nominal" else pairing.regression.explained(before, h)
+                )
             if self._first is not None:
                 explained = explained - np.matvec(self.estimator.jacobian(self._first, q), step)
         predicted = np.matvec(last.jacobian, step)
@@ -194,8 +232,13 @@ class Estimation:
     def diagnostics(self, state: EstimationState) -> Diagnostics:
         """Return the diagnostics of both stages, with ‖Δy − ĴΔq‖ of the last motion as `jacobian_prediction_error`."""
         learned = state.learned
-        found = {"jacobian_prediction_error": learned.unexplained, **self.estimator.diagnostics(learned.estimator)}
-        return found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}
+        found = {
+            "jacobian_prediction_error": learned.unexplained,
+            **self.estimator.diagnostics(learned.estimator),
+        }
+        return (
+            found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}
+        )
 
 
 def _other(_: Any, other: Any) -> Any:  # noqa: ANN401 - states of an estimator

@@ -43,7 +43,9 @@ def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     Returns:
         (..., n), rad/s.
     """
-    return np.asarray(joint_velocity / np.maximum(largest_excess(joint_velocity, limit), 1.0)[..., None])
+    return np.asarray(
+        joint_velocity / np.maximum(largest_excess(joint_velocity, limit), 1.0)[..., None]
+    )
 
 
 class _Shared(NamedTuple):
@@ -80,7 +82,9 @@ def redistribute(
     """
     take_over = partial(_take_over, limit=limit, damping=damping)
 
-    def shared(joint_step: FloatArray, jacobian: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
+    def shared(
+        joint_step: FloatArray, jacobian: FloatArray, down: FloatArray, up: FloatArray
+    ) -> FloatArray:
         excess = largest_excess(joint_step, limit)
         dq = joint_step / excess[..., None]
         free = np.abs(dq) < limit - MIN_ROOM * limit
@@ -109,12 +113,20 @@ def _take_over(state: _Shared, limit: FloatArray, damping: float) -> _Shared:
     stuck = free & (room <= MIN_ROOM * limit)
     free = free & ~stuck
     use = np.divide(np.abs(more), room, where=free, out=np.zeros_like(more))
-    share = (1.0 - np.logical_or.reduce(stuck, axis=-1)) / np.maximum.reduce(use, axis=-1, initial=1.0)
-    return state._replace(joint_step=dq + share[..., None] * more, left=state.left * (1.0 - share), free=free)
+    share = (1.0 - np.logical_or.reduce(stuck, axis=-1)) / np.maximum.reduce(
+        use, axis=-1, initial=1.0
+    )
+    return state._replace(
+        joint_step=dq + share[..., None] * more, left=state.left * (1.0 - share), free=free
+    )
 
 
 def step_with_posture(
-    inverse: FloatArray, jacobian: FloatArray, feature_step: FloatArray, away: FloatArray, share: float
+    inverse: FloatArray,
+    jacobian: FloatArray,
+    feature_step: FloatArray,
+    away: FloatArray,
+    share: float,
 ) -> FloatArray:
     """Return J⁺ v + κ (I − J⁺J)(q_c − q), (..., n), rad.
 
@@ -125,7 +137,9 @@ def step_with_posture(
         away: q_c − q, from the present joint position to the wanted posture, (..., n), rad.
         share: κ, of that distance; 0 for no posture.
     """
-    step: FloatArray = np.matvec(inverse, feature_step - share * np.matvec(jacobian, away)) + share * away
+    step: FloatArray = (
+        np.matvec(inverse, feature_step - share * np.matvec(jacobian, away)) + share * away
+    )
     return step
 
 
@@ -133,7 +147,9 @@ def step_with_posture(
 class Finish:
     """Applies those of the stages above whose aids are on; they have no state."""
 
-    def __init__(self, aids: AidsConfig, knowledge: RobotKnowledge, law: str, owns: Collection[str]) -> None:
+    def __init__(
+        self, aids: AidsConfig, knowledge: RobotKnowledge, law: str, owns: Collection[str]
+    ) -> None:
         """Take settings, limits and the working region.
 
         Args:
@@ -145,7 +161,10 @@ class Finish:
         Raises:
             ValueError: a stage that the law brings itself, or a feedforward without a preview.
         """
-        asked = ("preview", "feedforward", aids.feedforward), ("limit", "limit", aids.limit != "scale")
+        asked = (
+            ("preview", "feedforward", aids.feedforward),
+            ("limit", "limit", aids.limit != "scale"),
+        )
         for stage, aid, on in asked:
             if on and stage in owns:
                 raise ValueError(f"aids.{aid}: {law} brings its own {stage}; leave this aid out")
@@ -159,7 +178,11 @@ class Finish:
         self._adds = aids.feedforward or aids.posture
 
     def finish(
-        self, wanted: FloatArray, jacobian: FloatArray, joint_position: FloatArray, forward: FloatArray
+        self,
+        wanted: FloatArray,
+        jacobian: FloatArray,
+        joint_position: FloatArray,
+        forward: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
         """Return the joint velocity (..., n), rad/s, that leaves the chain, and whether it was limited, (...).
 
@@ -172,14 +195,21 @@ class Finish:
         aids = self._aids
         if self._adds:
             inverse = damped_inverse(jacobian, aids.damping)
-            step = step_with_posture(inverse, jacobian, forward, self._centre - joint_position, self._share)
+            step = step_with_posture(
+                inverse, jacobian, forward, self._centre - joint_position, self._share
+            )
             wanted = wanted + step / self._period
         excess = largest_excess(wanted, self._limit)
         if aids.limit == "clip":
             return np.clip(wanted, -self._limit, self._limit), excess > 1.0
         if aids.limit == "redistribute":
             lower, upper = self._region
-            further = np.maximum(joint_position - lower, 0.0), np.maximum(upper - joint_position, 0.0)
-            step = redistribute(wanted * self._period, jacobian, self._limit * self._period, aids.damping, further)
+            further = (
+                np.maximum(joint_position - lower, 0.0),
+                np.maximum(upper - joint_position, 0.0),
+            )
+            step = redistribute(
+                wanted * self._period, jacobian, self._limit * self._period, aids.damping, further
+            )
             return step / self._period, excess > 1.0
         return wanted / np.maximum(excess, 1.0)[..., None], excess > 1.0

@@ -45,7 +45,9 @@ class NoiseLevel(NamedTuple):
         deviation: FloatArray = np.sqrt(self.variance)
         return deviation
 
-    def learn(self, square: FloatArray, count: FloatArray, multiple: FloatArray, other: FloatArray) -> NoiseLevel:
+    def learn(
+        self, square: FloatArray, count: FloatArray, multiple: FloatArray, other: FloatArray
+    ) -> NoiseLevel:
         """Return the state after an innovation; one of exactly 0 is that of the same frame and holds no information.
 
         Args:
@@ -58,7 +60,11 @@ class NoiseLevel(NamedTuple):
 
 
 def _learned(
-    level: NoiseLevel, square: FloatArray, count: FloatArray, multiple: FloatArray, other: FloatArray
+    level: NoiseLevel,
+    square: FloatArray,
+    count: FloatArray,
+    multiple: FloatArray,
+    other: FloatArray,
 ) -> NoiseLevel:
     own = (multiple * level.guess)[..., None] * np.exp(2.0 * LOG_RATIOS)
     s, K = own + np.maximum(other, 0.0)[..., None], count[..., None]

@@ -47,8 +47,12 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
-MAX_GAP = 16  # longest motion over lost frames from which is learned, in motions of the least length
-MIN_CHANGE_RATIO = 0.8  # [1] of a motion's change between candidates to noise, above which delays differ
+MAX_GAP = (
+    16  # longest motion over lost frames from which is learned, in motions of the least length
+)
+MIN_CHANGE_RATIO = (
+    0.8  # [1] of a motion's change between candidates to noise, above which delays differ
+)
 MAX_BIAS_RATIO = 0.25  # [1] of the model's error to noise, above which a steady motion would favour a wrong delay
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
 DOUBT: Final = 100.0  # [1] g
@@ -58,7 +62,9 @@ MAP_WALK: Final = 0.1  # [1/√m] w, of an entry of M
 REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
 REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
 MODEL_ERROR: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
-MAP_DEVIATION: Final = 0.55  # [1] of an entry of M at first; larger ones favour late delays while an arm speeds up
+MAP_DEVIATION: Final = (
+    0.55  # [1] of an entry of M at first; larger ones favour late delays while an arm speeds up
+)
 FeatureMotion: TypeAlias = tuple[FloatArray, FloatArray, BoolArray]  # the first three of `Paired`
 
 
@@ -85,7 +91,11 @@ class Candidates:
         self.longest = int(self._whole[-1])
         c = delays - self._whole
         bend = -0.5 * c * (1.0 - c)
-        weights = np.stack([1.0 - c + bend, c - 2.0 * bend, bend]) if c.any() else np.ones((1, len(delays)))
+        weights = (
+            np.stack([1.0 - c + bend, c - 2.0 * bend, bend])
+            if c.any()
+            else np.ones((1, len(delays)))
+        )
         self._weights = weights[..., None]
 
     @classmethod
@@ -94,18 +104,24 @@ class Candidates:
 
         They lie about `RESOLUTION` apart: a whole number of periods, or a period divided by a whole number.
         """
-        spacing = max(1, whole_periods(RESOLUTION, period)) / max(1, whole_periods(period, RESOLUTION))
+        spacing = max(1, whole_periods(RESOLUTION, period)) / max(
+            1, whole_periods(period, RESOLUTION)
+        )
         count = 1 + math.floor(whole_periods(longest, period) / spacing)
         return cls(np.asarray(spacing * np.arange(count), dtype=np.float64))
 
     def ends(self, past: FloatArray) -> FloatArray:
         """Return the past (..., H, columns) at each delay, (..., D, columns)."""
-        return weighted(self._weights, [past[..., self._whole + i, :] for i in range(len(self._weights))])
+        return weighted(
+            self._weights, [past[..., self._whole + i, :] for i in range(len(self._weights))]
+        )
 
     def begins(self, past: FloatArray, periods: FloatArray) -> FloatArray:
         """Return the past (..., H, columns) at each delay and about `periods` (...) before, (..., D, columns)."""
         first = self._whole + np.rint(periods).astype(np.int_)[..., None]
-        return weighted(self._weights, [pick(past, first + i, axes=1) for i in range(len(self._weights))])
+        return weighted(
+            self._weights, [pick(past, first + i, axes=1) for i in range(len(self._weights))]
+        )
 
     def exposed(self, past: FloatArray, candidate: IntArray) -> FloatArray:
         """Return the past (..., H, columns) at a candidate delay (...) and a period before, (..., 2, columns)."""
@@ -180,7 +196,9 @@ class Past(NamedTuple):
     before: FloatArray  # q(k−d) − q(k−d−1), (..., n), rad.
     # J_n Δq, (..., m), along each of them: from q(k−d−1) to q(k−d), and from there to q(k).
     predicted: tuple[FloatArray, FloatArray]
-    window: FloatArray  # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
+    window: (
+        FloatArray  # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
+    )
     noise: FloatArray  # e, (..., m), of the last frame from which was learned.
 
 
@@ -225,7 +243,9 @@ class Pairing:
         )
         past, unset = np.repeat(row[..., None, :], self._rows, axis=-2), cast("Anchor", None)
         noise = NoiseLevel.start(self._aids.feature_noise, lead)
-        return PairState(past, base, noise=noise, nis=np.zeros(lead)[()], anchor=unset, **known._asdict()).anchored()
+        return PairState(
+            past, base, noise=noise, nis=np.zeros(lead)[()], anchor=unset, **known._asdict()
+        ).anchored()
 
     def advance(self, state: PairState, joint_position: FloatArray, base: FloatArray) -> PairState:
         """Return the state one period later, with the arm at `joint_position` (..., n), rad, and J_n there."""
@@ -247,7 +267,9 @@ class Pairing:
         exposed, before = rows[..., 0, :], rows[..., 0, :] - rows[..., 1, :]
         since = state.past[..., 0, :] - exposed
         moved, noise = joint_position - state.past[..., window, :n], state.regression.mean[..., -1]
-        return Past(exposed[..., :n], before[..., :n], (before[..., n:], since[..., n:]), moved, noise)
+        return Past(
+            exposed[..., :n], before[..., :n], (before[..., n:], since[..., n:]), moved, noise
+        )
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""
@@ -270,20 +292,38 @@ class Pairing:
         since = anchor._replace(step=step, duration=total, valid=anchor.valid & valid)
         first = self._candidates.begins(state.past, total / self._period)
         miss = self._miss(None, since, first, pick(end, anchor.known.candidate)[..., None, :])
-        back = (miss < RETURN * anchor.miss) & np.logical_and.reduce(since.valid == anchor.valid, axis=-1)
-        state = branch(back, lambda now, known: now._replace(**known._asdict()), state, anchor.known)
-        motion = branch(back, lambda _, whole: whole, (feature_step, duration, valid), (step, total, since.valid))
+        back = (miss < RETURN * anchor.miss) & np.logical_and.reduce(
+            since.valid == anchor.valid, axis=-1
+        )
+        state = branch(
+            back, lambda now, known: now._replace(**known._asdict()), state, anchor.known
+        )
+        motion = branch(
+            back,
+            lambda _, whole: whole,
+            (feature_step, duration, valid),
+            (step, total, since.valid),
+        )
         periods, shorter = duration / self._period, (anchor.miss > 0.0) & ~back
-        begin = branch(shorter, lambda _, *last: self._candidates.begins(*last), first, state.past, periods)
+        begin = branch(
+            shorter, lambda _, *last: self._candidates.begins(*last), first, state.past, periods
+        )
         state, paired = self._learned(state, motion, begin, end, back)
         least, state = DOUBT * state.noise.variance, state.anchored()
         doubtful = ~back & (total < self._doubtful) & (miss > least)
         since = since._replace(miss=branch(doubtful, self._miss, miss, since, first, end))
-        anchor = branch(doubtful & (since.miss > least), lambda _, older: older, state.anchor, since)
+        anchor = branch(
+            doubtful & (since.miss > least), lambda _, older: older, state.anchor, since
+        )
         return state._replace(anchor=anchor), paired
 
     def _learned(
-        self, state: PairState, motion: FeatureMotion, begin: FloatArray, end: FloatArray, back: BoolArray
+        self,
+        state: PairState,
+        motion: FeatureMotion,
+        begin: FloatArray,
+        end: FloatArray,
+        back: BoolArray,
     ) -> tuple[PairState, Paired]:
         """Return `learn` from a motion that is believed, with the past at both of its ends, (..., D, n + m)."""
         n, (feature_step, duration, valid) = self._n, motion
@@ -296,19 +336,29 @@ class Pairing:
         q, step, x = begin[..., :n], passed[..., :n], passed[..., n:]
         h = self.regression.regressors(q + 0.5 * step, step, x)
         paired = Paired(*motion, q, step, x, h, state.regression, back)
-        foreseen = self.regression.explained(state.regression, paired.h) - state.regression.mean[..., -1]
+        foreseen = (
+            self.regression.explained(state.regression, paired.h) - state.regression.mean[..., -1]
+        )
         dy = np.where(valid, feature_step, foreseen)
-        regression = self.regression.update(state.regression, paired.h, dy, duration, state.noise.variance)
+        regression = self.regression.update(
+            state.regression, paired.h, dy, duration, state.noise.variance
+        )
         moved = regression.moves > state.regression.moves
         state = branch(moved, self._forget, state._replace(regression=regression))
         return state, paired
 
-    def _miss(self, _: FloatArray | None, since: Anchor, begin: FloatArray, end: FloatArray) -> FloatArray:
+    def _miss(
+        self, _: FloatArray | None, since: Anchor, begin: FloatArray, end: FloatArray
+    ) -> FloatArray:
         """Return the least ‖ν‖², (...), of the motion from `begin` by the delay to each `end`, (..., *, n + m)."""
         n, m, known = self._n, self._m, since.known
         passed = end - pick(begin, known.candidate)[..., None, :]
         W = pick(known.bank, known.candidate)[..., None, :m, :]
-        foreseen = np.matvec(W[..., :m], passed[..., n:]) + np.matvec(W[..., m:-1], passed[..., :n]) - W[..., -1]
+        foreseen = (
+            np.matvec(W[..., :m], passed[..., n:])
+            + np.matvec(W[..., m:-1], passed[..., :n])
+            - W[..., -1]
+        )
         nu = np.where(since.valid[..., None, :], since.step[..., None, :] - foreseen, 0.0)
         return np.asarray(np.minimum.reduce(np.vecdot(nu, nu), axis=-1))
 
@@ -333,14 +383,20 @@ class Pairing:
 
     def _forget(self, state: PairState) -> PairState:
         """Return the state in which any map is possible."""
-        bank = fresh_bank(state.bank[..., : self._m, :-1], self._variances, state.noise.variance[..., None])
+        bank = fresh_bank(
+            state.bank[..., : self._m, :-1], self._variances, state.noise.variance[..., None]
+        )
         return state._replace(bank=bank)
 
-    def _find_delay(self, state: PairState, h: FloatArray, feature_step: FloatArray, valid: BoolArray) -> PairState:
+    def _find_delay(
+        self, state: PairState, h: FloatArray, feature_step: FloatArray, valid: BoolArray
+    ) -> PairState:
         """Update filter and score of every delay, choose among them, and learn the noise."""
         aids, m, candidate, frame = self._aids, self._m, state.candidate, state.noise.variance
         lengths, turns = norm(h[..., :m]), norm(h[..., m:])
-        steps = np.repeat(np.stack([MAP_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1), (m, self._n), axis=-1)
+        steps = np.repeat(
+            np.stack([MAP_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1), (m, self._n), axis=-1
+        )
         model = MODEL_ERROR**2 * (lengths * lengths)
         learns = lengths * lengths >= frame[..., None]
         bank, innovations = learn(state.bank, h, feature_step, frame, model, steps, learns)
@@ -367,4 +423,7 @@ class Pairing:
         changes = norm(x - x[..., self._candidates.beside, :])
         change, length = (np.maximum.reduce(each, axis=-1) for each in (changes, lengths))
         error = MODEL_ERROR * length
-        return np.asarray((change >= MIN_CHANGE_RATIO * noise.deviation) | (error < MAX_BIAS_RATIO * noise.deviation))
+        return np.asarray(
+            (change >= MIN_CHANGE_RATIO * noise.deviation)
+            | (error < MAX_BIAS_RATIO * noise.deviation)
+        )

@@ -46,10 +46,14 @@ from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import Observation
 
 WINDOW = 0.05  # [s] over which motions are compared, and no shorter than a period; steps of encoders spoil shorter ones
-PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some milliradians outweighs it
+PRIOR_WEIGHT = (
+    2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some milliradians outweighs it
+)
 PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
 MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
-PREDICTION_TOLERANCE = 0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
+PREDICTION_TOLERANCE = (
+    0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
+)
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
 MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that does not overshoot
 
@@ -67,7 +71,9 @@ class JointResponse(NamedTuple):
     period: float  # s
 
     @classmethod
-    def immediate(cls, length: int, joint_position: FloatArray, period: float, window: int = 1) -> JointResponse:
+    def immediate(
+        cls, length: int, joint_position: FloatArray, period: float, window: int = 1
+    ) -> JointResponse:
         """Return the response g₀ of an arm that follows at once and rests.
 
         Args:
@@ -77,7 +83,9 @@ class JointResponse(NamedTuple):
             window: w, periods.
         """
         *lead, n = joint_position.shape
-        weights = PRIOR_WEIGHT * window**2 * period * np.exp(PRIOR_GROWTH * period * np.arange(length))
+        weights = (
+            PRIOR_WEIGHT * window**2 * period * np.exp(PRIOR_GROWTH * period * np.arange(length))
+        )
         first = np.broadcast_to(np.eye(length)[0], (*lead, length))
         A = np.broadcast_to(np.diag(weights), (*lead, length, length))
         commands = np.zeros((*lead, length + window - 1, n))
@@ -85,7 +93,9 @@ class JointResponse(NamedTuple):
         return with_response(state, first)
 
     @classmethod
-    def given(cls, delay: float, lag: float, period: float, length: int, joint_position: FloatArray) -> JointResponse:
+    def given(
+        cls, delay: float, lag: float, period: float, length: int, joint_position: FloatArray
+    ) -> JointResponse:
         """Return the response of joints with a delay and a first-order lag, which never changes.
 
         Args:
@@ -134,7 +144,9 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
     kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]
     A, b = kept[..., None] * A, kept * b
     response = np.linalg.solve(A, b[..., None])[..., 0]
-    if state.window == 1:  # in longer windows single entries are not identified, and limits would shift their sum
+    if (
+        state.window == 1
+    ):  # in longer windows single entries are not identified, and limits would shift their sum
         response = np.minimum(np.maximum(response, 0.0), MAX_RESPONSE)
     return with_response(state._replace(A=A, b=b), response)
 
@@ -146,7 +158,9 @@ def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
     left[..., :-1] = ahead[..., 1:]
     total = ahead[..., 0]
     lead = np.add.reduce(left, axis=-1) / np.maximum(total, 0.5)
-    return state._replace(response=response, left=left, lead=np.minimum(lead, response.shape[-1]) * (total > 0.5))
+    return state._replace(
+        response=response, left=left, lead=np.minimum(lead, response.shape[-1]) * (total > 0.5)
+    )
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:
@@ -198,7 +212,9 @@ class Predictor:
             share: of a frame's innovation that is noise, which the filter takes from every frame.
         """
         aids, other = self._aids, copy.copy(self)
-        other._aids = replace(aids, response=aids.response if aids.response == "ignored" else "given")
+        other._aids = replace(
+            aids, response=aids.response if aids.response == "ignored" else "given"
+        )
         other._share = share
         return other
 
@@ -213,7 +229,11 @@ class Predictor:
         return PredictorState(response, observation.feature)
 
     def predict(
-        self, state: PredictorState, stages: Estimation, estimation: EstimationState, observation: Observation
+        self,
+        state: PredictorState,
+        stages: Estimation,
+        estimation: EstimationState,
+        observation: Observation,
     ) -> tuple[PredictorState, Observation, FloatArray, FloatArray]:
         """Return the new state, ŷ and q̂ as the observation that a law gets, lead, (...) [periods], and Ĵ(q̂).
 
@@ -229,19 +249,28 @@ class Predictor:
         past = pairing.past(estimation.learned.pair, q, self.window)
         response, bound, lead = state.response, q, np.zeros(q.shape[:-1])[()]
         if self._aids.response != "ignored":
-            response = response.learn(past.window) if self._aids.response == "identified" else response
+            response = (
+                response.learn(past.window) if self._aids.response == "identified" else response
+            )
             bound, lead = q + response.flight(), response.lead
         z = observation.feature
         if self._aids.filter:
-            moved = stages.motion(estimation, past.exposed - past.before, past.before, past.predicted[0])
+            moved = stages.motion(
+                estimation, past.exposed - past.before, past.before, past.predicted[0]
+            )
             expected, noise = state.feature + moved, past.noise
             learned = np.equal(estimation.last.time, observation.time)
             if self._share is not None:
-                noise, learned = self._share * (z - expected), np.full_like(learned, fill_value=True)
+                noise, learned = (
+                    self._share * (z - expected),
+                    np.full_like(learned, fill_value=True),
+                )
             z = np.where(learned[..., None] & observation.valid, z - noise, expected)
         J, nominal = stages.ahead(estimation, bound)
         flight = 0.5 * np.matvec(estimation.learned.pair.base + nominal, bound - q)
-        feature = z + stages.motion(estimation, past.exposed, bound - past.exposed, past.predicted[1] + flight)
+        feature = z + stages.motion(
+            estimation, past.exposed, bound - past.exposed, past.predicted[1] + flight
+        )
         return PredictorState(response, z), observation.with_values(bound, feature), lead, J
 
     def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
@@ -260,7 +289,9 @@ def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:
         rows: how many instants are wanted, at most 1 + preview.
     """
     now = reference[..., :rows, :]
-    return branch(lead > 0.0, _interpolated, now, reference, lead) if reference.shape[-2] > 1 else now
+    return (
+        branch(lead > 0.0, _interpolated, now, reference, lead) if reference.shape[-2] > 1 else now
+    )
 
 
 def _interpolated(now: FloatArray, reference: FloatArray, lead: FloatArray) -> FloatArray:

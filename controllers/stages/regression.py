@@ -47,18 +47,29 @@ from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
-LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
-PIECE: Final = 32  # runs side by side whose filters are updated at once; all of them if a single one learns
+LEAD_CAP: Final = (
+    100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
+)
+PIECE: Final = (
+    32  # runs side by side whose filters are updated at once; all of them if a single one learns
+)
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
-MOVED_FRAMES: Final = 3  # successive frames that do not fit but agree with each other, of a moved camera
-AGREEMENT: Final = 0.25  # [1] of ‖ν‖², below which ‖ν − e‖² says that a frame agrees with the one before
-DEVIATIONS: Final = np.array([0.01, 0.01, 0.1, 0.4])  # [m/rad] prior deviation of an entry of E; per rad of H
+MOVED_FRAMES: Final = (
+    3  # successive frames that do not fit but agree with each other, of a moved camera
+)
+AGREEMENT: Final = (
+    0.25  # [1] of ‖ν‖², below which ‖ν − e‖² says that a frame agrees with the one before
+)
+# [m/rad] prior deviation of an entry of E; per rad of H
+DEVIATIONS: Final = np.array([0.01, 0.01, 0.1, 0.4])
 PRIOR: Final = np.array([0.0, 6.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
 MODEL_ERROR: Final = 0.02  # [m/rad] c
-WALK: Final = np.array([0.0, 0.0, 0.1, 0.1])  # [1/√rad] of E and H, as a share of their prior deviation
+# [1/√rad] of E and H, as a share of their prior deviation
+WALK: Final = np.array([0.0, 0.0, 0.1, 0.1])
 MAP_WALK: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad] of M
-ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])  # [1] ς, of an entry of M from the nearest rotation; then any M
+# [1] ς, of an entry of M from the nearest rotation; then any M
+ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])
 
 
 class Innovation(NamedTuple):
@@ -123,7 +134,8 @@ def learn(
     known[..., m:-1] += walk * regressors
     Ph = known[..., m:]
     s = frame[..., None] + model + np.vecdot(h, Ph)
-    known[..., :m] -= feature_step[..., None, :]  # −ν above P h: minus their products with the gain is the change
+    # −ν above P h: minus their products with the gain is the change
+    known[..., :m] -= feature_step[..., None, :]
     square = np.vecdot(known[..., :m], known[..., :m])
     capped = np.maximum(s, square / GATE)
     noise = frame[..., None] + (capped - s)
@@ -164,7 +176,9 @@ class RegressionState(NamedTuple):
     scores: FloatArray  # ℓ_b, (..., B)
     mean: FloatArray  # W̄ with e, (..., m, K)
     share: FloatArray  # Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise
-    rotation: FloatArray  # R of the filter with the largest weight of those that have one, (..., m, m)
+    rotation: (
+        FloatArray  # R of the filter with the largest weight of those that have one, (..., m, m)
+    )
     rotations: FloatArray  # R of each filter that has one, (..., R, m, m)
     excess: FloatArray  # (M − R) (P_MM + ς² I)⁻¹ of each of them; like R it changes with W and P_WW only
     streak: IntArray  # number of successive frames that do not fit but agree with each other, (...)
@@ -185,7 +199,9 @@ class Regression:
         self._map = slice(n + len(self._pairs[0]), n + len(self._pairs[0]) + m)
         own = np.repeat(DEVIATIONS[:, None] ** 2, self._map.start, axis=1)
         self._P0 = np.concatenate([own, np.ones((len(DEVIATIONS), m))], axis=1)
-        self._walk = np.concatenate([WALK[:, None] ** 2 * own, np.repeat(MAP_WALK[:, None] ** 2, m, axis=1)], axis=1)
+        self._walk = np.concatenate(
+            [WALK[:, None] ** 2 * own, np.repeat(MAP_WALK[:, None] ** 2, m, axis=1)], axis=1
+        )
 
     def start(self, lead: tuple[int, ...], frame: float) -> RegressionState:
         """Return the state of the nominal model, for the variance σ² of a frame, m²."""
@@ -197,7 +213,9 @@ class Regression:
         return RegressionState(
             np.broadcast_to(bank, (*lead, *bank.shape)),
             np.broadcast_to(PRIOR, (*lead, len(PRIOR))),
-            np.broadcast_to(np.concatenate([W, np.zeros((m, 1))], axis=1), (*lead, m, self._map.stop + 1)),
+            np.broadcast_to(
+                np.concatenate([W, np.zeros((m, 1))], axis=1), (*lead, m, self._map.stop + 1)
+            ),
             np.zeros(lead)[()],
             np.broadcast_to(np.eye(m), (*lead, m, m)),
             np.broadcast_to(np.eye(m), near),
@@ -210,10 +228,17 @@ class Regression:
         """Return the state after a frame at which no motion ended."""
         mean = state.mean.copy()
         mean[..., -1] = 0.0
-        return state._replace(bank=interrupted(state.bank, frame), mean=mean, share=np.zeros_like(state.share))
+        return state._replace(
+            bank=interrupted(state.bank, frame), mean=mean, share=np.zeros_like(state.share)
+        )
 
     def update(
-        self, state: RegressionState, h: FloatArray, feature_step: FloatArray, duration: FloatArray, frame: FloatArray
+        self,
+        state: RegressionState,
+        h: FloatArray,
+        feature_step: FloatArray,
+        duration: FloatArray,
+        frame: FloatArray,
     ) -> RegressionState:
         """Return the state after a motion.
 
@@ -229,13 +254,20 @@ class Regression:
         moved = square >= MIN_MOTION**2
         walk = (np.sqrt(square) * moved)[..., None, None] * self._walk
         model = REST_DRIFT**2 * duration[..., None] + MODEL_ERROR**2 * square[..., None]
-        bank, found = learn(state.bank, h[..., None, :], feature_step, frame, model, walk, moved[..., None])
+        bank, found = learn(
+            state.bank, h[..., None, :], feature_step, frame, model, walk, moved[..., None]
+        )
         evidence = found.square / found.capped + self._m * np.log(found.capped)
         scores = state.scores + evidence * moved[..., None]
         scores = np.minimum(scores - np.minimum.reduce(scores, axis=-1)[..., None], LEAD_CAP)
         best = scores.argmin(axis=-1)
-        streak = self._streak(state, of_filter(found, best), pick(state.bank[..., : self._m, -1], best))
-        state, jumped = state._replace(bank=bank, scores=scores, streak=streak), streak >= MOVED_FRAMES
+        streak = self._streak(
+            state, of_filter(found, best), pick(state.bank[..., : self._m, -1], best)
+        )
+        state, jumped = (
+            state._replace(bank=bank, scores=scores, streak=streak),
+            streak >= MOVED_FRAMES,
+        )
         state = branch(jumped, self._forget, state, frame)
         before = state.rotations, state.excess
         columns = state.bank[..., : len(ROTATION_DEVIATIONS), :, self._map]
@@ -244,13 +276,17 @@ class Regression:
         noise = 1.0 - (found.variance - frame[..., None]) / found.capped
         return self._combined(state, best, noise)
 
-    def jacobian(self, state: RegressionState, joint_position: FloatArray, nominal: FloatArray) -> FloatArray:
+    def jacobian(
+        self, state: RegressionState, joint_position: FloatArray, nominal: FloatArray
+    ) -> FloatArray:
         """Return Ĵ, (..., m, n), at `joint_position` (..., n), rad, for J_n (..., m, n) there."""
         n, W = self._n, state.mean
         H = W[..., n : self._map.start] @ self._quadratic(joint_position)
         return np.asarray(W[..., self._map] @ nominal + W[..., :n] + H)
 
-    def regressors(self, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray) -> FloatArray:
+    def regressors(
+        self, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
+    ) -> FloatArray:
         """Return h, (..., K−1), of a motion but for the −1 of e.
 
         Args:
@@ -258,7 +294,9 @@ class Regression:
             joint_step: Δq, (..., n), rad.
             predicted: J_n Δq, (..., m), m.
         """
-        return np.concatenate([joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1)
+        return np.concatenate(
+            [joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1
+        )
 
     def explained(self, state: RegressionState, h: FloatArray) -> FloatArray:
         """Return the motion Ĵ Δq, (..., m), of a joint motion with the regressors h."""
@@ -293,7 +331,9 @@ class Regression:
         bank = fresh_bank(state.bank[..., : self._m, :-1], self._P0, frame[..., None])
         return state._replace(bank=bank, streak=np.zeros_like(state.streak), moves=state.moves + 1)
 
-    def _combined(self, state: RegressionState, best: IntArray, noise: FloatArray) -> RegressionState:
+    def _combined(
+        self, state: RegressionState, best: IntArray, noise: FloatArray
+    ) -> RegressionState:
         """Return the state with W̄, after each M was completed towards the rotation nearest to it.
 
         With the prior belief that an entry of M is N(R, ς²), and M ~ N(R, P_MM + ς² I) by rows,

@@ -24,7 +24,8 @@ class DampedInverse(servobench.Controller):
     aids = servobench.EQUIPPED
 
     def __init__(self, config: DampedInverseConfig, knowledge):
-        self.config, self.jacobian = config, knowledge.nominal_jacobian  # in `step` the aids correct it
+        # In `step` the aids correct it
+        self.config, self.jacobian = (config, knowledge.nominal_jacobian)
 
     def reset(self, observation, seed):
         """Nothing is remembered between periods."""

@@ -44,8 +44,15 @@ class Excite(servobench.Controller):
     def position(self, time):
         """Return the swing of each joint at a time, (n,) rad."""
         sines = np.sin(2.0 * np.pi * self.frequency * time + self.phase).sum(axis=1)
-        return self.share * self.config.swing / self.config.sines**0.5 * min(1.0, time / self.config.ramp) * sines
+        return (
+            self.share
+            * self.config.swing
+            / self.config.sines**0.5
+            * min(1.0, time / self.config.ramp)
+            * sines
+        )
 
     def step(self, observation, reference):
         now, then = self.position(observation.time), self.position(observation.time + self.period)
-        return servobench.Command(np.clip((then - now) / self.period, -self.limit, self.limit))  # logged as it is sent
+        # Logged as it is sent
+        return servobench.Command(np.clip((then - now) / self.period, -self.limit, self.limit))

@@ -33,7 +33,8 @@ class KalmanInverse(servobench.Controller):
     aids = servobench.EQUIPPED
 
     def __init__(self, config: KalmanInverseConfig, knowledge):
-        self.config, self.jacobian = config, knowledge.nominal_jacobian  # in `step` the aids correct it
+        # In `step` the aids correct it
+        self.config, self.jacobian = (config, knowledge.nominal_jacobian)
 
     def reset(self, observation, seed):
         self.q, self.y = observation.joint_position, observation.feature

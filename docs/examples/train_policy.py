@@ -101,7 +101,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=2_000_000)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("policy.npz"))
-    parser.add_argument("--seed", type=int, default=0, help="of the training: robots, first weights, exploration")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of the training: robots, first weights, exploration"
+    )
     given = parser.parse_args()
     np.savez(given.out, *layers(train(given.steps, given.seed)))
     print(f"{given.out}: trained for {given.steps:,} steps")

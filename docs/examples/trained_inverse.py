@@ -27,18 +27,26 @@ class TrainedInverse(servobench.Controller):
     """
 
     aids = servobench.EQUIPPED
-    in_model_frame = True  # trained on the nominal model: the aids turn features into the frame of its camera
+    in_model_frame = (
+        True  # trained on the nominal model: the aids turn features into the frame of its camera
+    )
 
     def __init__(self, config: TrainedInverseConfig, knowledge):
         rng, (lower, upper) = np.random.default_rng(0), knowledge.region
-        self.gain, self.centre, self.half = config.gain, (lower + upper) / 2.0, (upper - lower) / 2.0
+        self.gain, self.centre, self.half = (
+            config.gain,
+            (lower + upper) / 2.0,
+            (upper - lower) / 2.0,
+        )
         self.W = 0.5 * rng.normal(size=(config.units, len(lower)))
         self.b = rng.uniform(-1.0, 1.0, config.units)
         q = rng.uniform(lower, upper, (config.samples, len(lower)))
         J = knowledge.nominal_jacobian(q)
         wanted = J.mT @ np.linalg.inv(J @ J.mT + config.damping**2 * np.eye(J.shape[-2]))
         H, self.shape = self.hidden(q), wanted.shape[1:]
-        self.V = np.linalg.solve(H.T @ H + 1e-3 * np.eye(H.shape[1]), H.T @ wanted.reshape(len(q), -1))
+        self.V = np.linalg.solve(
+            H.T @ H + 1e-3 * np.eye(H.shape[1]), H.T @ wanted.reshape(len(q), -1)
+        )
 
     def hidden(self, q):
         h = np.tanh((q - self.centre) / self.half @ self.W.T + self.b)

@@ -19,7 +19,9 @@ ANGLES = np.radians([0.0, 15.0, 30.0, 60.0, 90.0])
 if __name__ == "__main__":
     experiment = build(resolve(REQUEST, Settings()))
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
-    desired = experiment.scenario.reference.sampled(run.period, max(KNOCKED_AT) + FUTURE + 1 + run.preview_rows)
+    desired = experiment.scenario.reference.sampled(
+        run.period, max(KNOCKED_AT) + FUTURE + 1 + run.preview_rows
+    )
     pose = experiment.drawn.true.X_BC
 
     def advance(observation, first, last):
@@ -42,7 +44,12 @@ if __name__ == "__main__":
             turned[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
             plant.move_camera(turned)
             _, errors = advance(seen, period, period + FUTURE)
-            when, turn, largest, last = period * run.period, np.degrees(angle), 1e3 * errors.max(), 1e3 * errors[-1]
+            when, turn, largest, last = (
+                period * run.period,
+                np.degrees(angle),
+                1e3 * errors.max(),
+                1e3 * errors[-1],
+            )
             print(f"{when:14.1f} {turn:17.0f} {largest:20.1f} {last:22.1f}")
             plant.restore(saved[0])
             controller.restore(saved[1])

@@ -29,7 +29,9 @@ from servobench.harness.run.result import COMPLETED
 
 Cell: TypeAlias = Callable[[pd.DataFrame], str]  # what a table says of runs
 TAIL: Final = 0.95
-CHANGED: Final = " changed"  # end of the name of a method with one thing changed, beside the method as it is
+CHANGED: Final = (
+    " changed"  # end of the name of a method with one thing changed, beside the method as it is
+)
 
 
 def by_method(runs: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -38,7 +40,9 @@ def by_method(runs: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield str(name), own
 
 
-def rows_by_method(runs: pd.DataFrame, cells: Mapping[str, Cell], title: str = "method") -> Iterator[dict[str, str]]:
+def rows_by_method(
+    runs: pd.DataFrame, cells: Mapping[str, Cell], title: str = "method"
+) -> Iterator[dict[str, str]]:
     """Yield a row for each method, of its name and of what each of `cells` says of its runs."""
     for name, own in by_method(runs):
         yield {title: quoted(name)} | {heading: cell(own) for heading, cell in cells.items()}
@@ -85,20 +89,29 @@ def millimetres(runs: pd.DataFrame, column: str = "rms_error_evaluated", digits:
 
     Of a curve that not all runs followed, the share of lost runs is told, too.
     """
-    middle = short(median_with_interval(1000.0 * column_of(runs, column).where(runs["status"] == COMPLETED)), digits)
+    middle = short(
+        median_with_interval(1000.0 * column_of(runs, column).where(runs["status"] == COMPLETED)),
+        digits,
+    )
     return with_lost(middle, runs) if (texts_of(runs, "task_kind") == CURVE).all() else middle
 
 
 def worst_errors(runs: pd.DataFrame) -> str:
     """Return the mean of the worst twentieth of the errors in the last second [mm]."""
-    value = 1000.0 * tail_mean(column_of(runs, "steady_state_error").where(runs["status"] == COMPLETED), TAIL)
+    value = 1000.0 * tail_mean(
+        column_of(runs, "steady_state_error").where(runs["status"] == COMPLETED), TAIL
+    )
     return f"{value:.1f}" if value < float("inf") else MISSING
 
 
 def overshoot(runs: pd.DataFrame) -> str:
     """Return the median overshoot with its interval [%]."""
     values = 100.0 * column_of(runs, "overshoot")
-    return short(median_with_interval(values, missing="left_out"), 1) if values.notna().any() else MISSING
+    return (
+        short(median_with_interval(values, missing="left_out"), 1)
+        if values.notna().any()
+        else MISSING
+    )
 
 
 def counted(runs: pd.DataFrame) -> str:
@@ -157,7 +170,9 @@ class Measure:
         for pair, *found in zip(pairs, *compared, strict=True):
             one, other = (self._by_robot(runs[engine], pair) for engine in ENGINES)
             between = mean_with_interval((one - other).dropna().to_numpy())
-            cells = {engine: self.difference(each) for engine, each in zip(ENGINES, found, strict=True)}
+            cells = {
+                engine: self.difference(each) for engine, each in zip(ENGINES, found, strict=True)
+            }
             on_one_only = len({side(each.mean) for each in found}) > 1 and side(between) != 0
             yield {engine: marked(cell) for engine, cell in cells.items()} if on_one_only else cells
 
@@ -166,7 +181,8 @@ class Measure:
         own = runs[runs["task"] == self.task]
         values = column_of(own, self.metric).where(own["status"] == COMPLETED)
         first, second = (
-            values[own["controller"] == name].set_axis(own.loc[own["controller"] == name, "seed"]) for name in pair
+            values[own["controller"] == name].set_axis(own.loc[own["controller"] == name, "seed"])
+            for name in pair
         )
         return first - second
 
@@ -177,7 +193,9 @@ CIRCLES: Final = Measure("circle", "rms_error_evaluated", digits=1, factor=1e3) 
 
 def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame) -> pd.DataFrame:
     """Return the runs of methods with one thing changed, whose names end with `CHANGED`, and of methods as they are."""
-    return pd.concat([changed.assign(controller=changed["controller"] + CHANGED), usual]).assign(plant="")
+    return pd.concat([changed.assign(controller=changed["controller"] + CHANGED), usual]).assign(
+        plant=""
+    )
 
 
 def side(estimate: Estimate) -> int:

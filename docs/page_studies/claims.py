@@ -28,7 +28,9 @@ SEEDS: Final = "71000:71200"
 def answers_of(study: Study, folder: Path) -> pd.DataFrame:
     """Return the answers of all parts of a study."""
     parts = [folder / part / ANSWERS for part in study.commands]
-    tables = [pd.read_csv(path, dtype=str, keep_default_na=False) for path in parts if path.exists()]
+    tables = [
+        pd.read_csv(path, dtype=str, keep_default_na=False) for path in parts if path.exists()
+    ]
     return pd.concat(tables, ignore_index=True)
 
 
@@ -79,14 +81,20 @@ def lab_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return both measures of each method in both profiles, and the orders and claims that differ."""
     runs = load_runs(folder / "runs")
     parts = {name: runs[runs["mismatch"] == name] for name in PROFILES}
-    measured = (("settling [s]", "random", cells.settling), ("circle [mm]", "circle", cells.millimetres))
+    measured = (
+        ("settling [s]", "random", cells.settling),
+        ("circle [mm]", "circle", cells.millimetres),
+    )
     shown = {
         f"{title}, `{name}`": cells.where("mismatch", name, cells.where("task", task, cell))
         for title, task, cell in measured
         for name in PROFILES
     }
     changes = [*changed_orders(parts), *changed_claims(folder)]
-    return {"lab": pd.DataFrame(cells.rows_by_method(runs, shown)), "lab_changes": pd.DataFrame(changes)}
+    return {
+        "lab": pd.DataFrame(cells.rows_by_method(runs, shown)),
+        "lab_changes": pd.DataFrame(changes),
+    }
 
 
 def changed_orders(parts: dict[str, pd.DataFrame]) -> Iterator[dict[str, str]]:
@@ -96,18 +104,30 @@ def changed_orders(parts: dict[str, pd.DataFrame]) -> Iterator[dict[str, str]]:
         compared = {name: measure.compare(own, pairs) for name, own in parts.items()}
         for (one, other), *found in zip(pairs, *compared.values(), strict=True):
             if len({each.verdict for each in found}) > 1:
-                text = {f"`{name}`": measure.difference(each) for name, each in zip(PROFILES, found, strict=True)}
-                yield {"claim, or first and second method": f"`{one}`, `{other}`", "of": word} | text
+                text = {
+                    f"`{name}`": measure.difference(each)
+                    for name, each in zip(PROFILES, found, strict=True)
+                }
+                yield {
+                    "claim, or first and second method": f"`{one}`, `{other}`",
+                    "of": word,
+                } | text
 
 
 def changed_claims(folder: Path) -> Iterator[dict[str, str]]:
     """Yield the paper's claims whose verdicts differ between the profiles."""
     keys = ["claim", "statement", "division"]
-    answers = [pd.read_csv(folder / name / ANSWERS, dtype=str).set_index(keys)["verdict"] for name in PROFILES]
+    answers = [
+        pd.read_csv(folder / name / ANSWERS, dtype=str).set_index(keys)["verdict"]
+        for name in PROFILES
+    ]
     for (claim, statement, division), *verdicts in pd.concat(answers, axis=1).itertuples(name=None):
         if len(set(verdicts)) > 1:
             text = {f"`{name}`": verdict for name, verdict in zip(PROFILES, verdicts, strict=True)}
-            yield {"claim, or first and second method": titled(claim, statement), "of": division} | text
+            yield {
+                "claim, or first and second method": titled(claim, statement),
+                "of": division,
+            } | text
 
 
 CLAIMS = Study(
@@ -135,8 +155,13 @@ LAB = Study(
     "nine methods and the paper's claims in the profile `lab` beside `moderate`, 200 and 100 robots",
     6,
     {
-        "runs": sweep("kinematic", RENDERED, "random,circle", SEEDS, "--mismatch", ",".join(PROFILES)),
-        **{name: ("claims", "--plants", "kinematic", "--seeds", "100", "--mismatch", name) for name in PROFILES},
+        "runs": sweep(
+            "kinematic", RENDERED, "random,circle", SEEDS, "--mismatch", ",".join(PROFILES)
+        ),
+        **{
+            name: ("claims", "--plants", "kinematic", "--seeds", "100", "--mismatch", name)
+            for name in PROFILES
+        },
     },
     lab_tables,
 )

@@ -49,13 +49,22 @@ CHANGES = {
 def tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the rates of failure, what failed runs have in common, and how many settle with one thing changed."""
     runs = load_runs(folder / RUNS)
-    runs = runs.assign(failed=settling_times(runs).isna()).merge(robots(runs.drop_duplicates("seed")), on="seed")
+    runs = runs.assign(failed=settling_times(runs).isna()).merge(
+        robots(runs.drop_duplicates("seed")), on="seed"
+    )
     causes = {title: partial(cause_of_failure, cause=cause) for cause, title in CAUSES.items()}
-    again = {title: load_runs(folder / part_of(title)) for title in CHANGES} if runs["failed"].any() else {}
+    again = (
+        {title: load_runs(folder / part_of(title)) for title in CHANGES}
+        if runs["failed"].any()
+        else {}
+    )
     changed = []
     for method, own in by_method(runs):
         seeds = own.loc[own["failed"], "seed"]
-        same = {title: each[(each["controller"] == method) & each["seed"].isin(seeds)] for title, each in again.items()}
+        same = {
+            title: each[(each["controller"] == method) & each["seed"].isin(seeds)]
+            for title, each in again.items()
+        }
         if len(seeds):
             counts = {title: settled(each) for title, each in same.items()}
             changed.append({FAILED: f"{quoted(method)}, of {len(seeds)}"} | counts)
@@ -80,7 +89,11 @@ def repeated(options: Words) -> Callable[[Path], Words]:
     def command(folder: Path) -> Words:
         runs = load_runs(folder / RUNS)
         seeds = sorted(set(runs.loc[settling_times(runs).isna(), "seed"]))
-        return sweep("kinematic", FIVE, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
+        return (
+            sweep("kinematic", FIVE, "random", ",".join(map(str, seeds)) + ",", *options)
+            if seeds
+            else ()
+        )
 
     return command
 
@@ -88,24 +101,30 @@ def repeated(options: Words) -> Callable[[Path], Words]:
 def robots(runs: pd.DataFrame) -> pd.DataFrame:
     """Return what was drawn for each seed: mismatch and distance; all methods meet the same robots."""
     requests = [
-        RunRequest(row.plant, row.controller, row.task, row.mismatch, int(row.seed)) for row in runs.itertuples()
+        RunRequest(row.plant, row.controller, row.task, row.mismatch, int(row.seed))
+        for row in runs.itertuples()
     ]
     sections = resolve_sections(requests[:1], Settings())
     rows = []
     for request, text in zip(requests, runs["mismatch_values"], strict=True):
         drawn, values = draw(select(request, sections)), json.loads(text)
-        distance = np.linalg.norm(drawn.true.feature(drawn.scenario.start) - drawn.scenario.reference.at(0.0))
+        distance = np.linalg.norm(
+            drawn.true.feature(drawn.scenario.start) - drawn.scenario.reference.at(0.0)
+        )
         rows.append((request.seed, np.degrees(abs(values["camera_angle"])), distance))
     return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance"])
 
 
+# With the 95 % Wilson interval
 RATES = {
     "runs": lambda runs: f"{len(runs):,}",
     "periods": lambda runs: f"{runs['periods'].sum():,}",
     "ended early": lambda runs: ended_early(runs) or "0",
     "not settled": lambda runs: f"{(runs['failed'] & (runs['status'] == COMPLETED)).sum():,}",
-    "failure rate [95 % interval]": lambda runs: f"{success_rate(int(runs['failed'].sum()), len(runs)):.1e}",
-}  # with the 95 % Wilson interval
+    "failure rate [95 % interval]": lambda runs: (
+        f"{success_rate(int(runs['failed'].sum()), len(runs)):.1e}"
+    ),
+}
 
 
 def cause_of_failure(runs: pd.DataFrame, cause: str) -> str:
@@ -128,11 +147,19 @@ def exceedance(runs: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     for method, style in method_styles(runs["controller"].unique()).items():
-        errors = 1e3 * np.sort(runs.loc[runs["controller"] == method, "steady_state_error"].to_numpy())
+        errors = 1e3 * np.sort(
+            runs.loc[runs["controller"] == method, "steady_state_error"].to_numpy()
+        )
         shares = 1.0 - np.arange(len(errors)) / len(errors)
-        axes.plot(errors, shares, label=method, color=style.colour, linestyle=style.line, linewidth=1.4)
+        axes.plot(
+            errors, shares, label=method, color=style.colour, linestyle=style.line, linewidth=1.4
+        )
     axes.axvline(5.0, color="black", linewidth=0.8, label="settling band, 5 mm")
-    robots, (task,), (plant,) = runs["seed"].nunique(), runs["task"].unique(), runs["plant"].unique()
+    robots, (task,), (plant,) = (
+        runs["seed"].nunique(),
+        runs["task"].unique(),
+        runs["plant"].unique(),
+    )
     axes.set(
         title=f"{task} on {plant}, {robots:,} robots", xlabel="error of the last second [mm]", yscale="log",
         ylabel="share of runs with a larger error",

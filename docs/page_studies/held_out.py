@@ -12,7 +12,19 @@ import pandas as pd
 
 from page_studies import cells, study
 from page_studies.cells import CHANGED, CIRCLES, MOVES, Cell, quoted, rows_by_method, where
-from page_studies.study import BETTER, BOTH, ENGINES, FIVE, PUBLISHED, RENDERED, SUFFIX, Study, Words, settings, sweep
+from page_studies.study import (
+    BETTER,
+    BOTH,
+    ENGINES,
+    FIVE,
+    PUBLISHED,
+    RENDERED,
+    SUFFIX,
+    Study,
+    Words,
+    settings,
+    sweep,
+)
 from servobench.controllers.aids import SWITCHES, AidsConfig
 from servobench.harness.analysis.comparison import MISSING
 from servobench.harness.batch.results import load_runs
@@ -23,14 +35,17 @@ PAIRS: Final = [(BETTER, name) for name in BOTH if name != BETTER] + [
     (name.removesuffix(SUFFIX), name) for name in PUBLISHED
 ]
 """The better method with each other one, and each method best equipped with itself as published."""
-TITLES: Final = tuple(f"tuning study {k + 1}: settling time, s" for k in range(3))  # a file of tuned values has three
+# A file of tuned values has three
+TITLES: Final = tuple(f"tuning study {k + 1}: settling time, s" for k in range(3))
 USUAL: Final = "all"
 LESS: Final[Mapping[str, Any]] = {aid: getattr(AidsConfig(), aid) for aid in SWITCHES}
 """The value of each aid that leaves it out."""
 
 
 METHOD_CELLS: Final[Mapping[str, Cell]] = {
-    "division": lambda runs: "as published" if runs["controller"].iloc[0].endswith(SUFFIX) else "best equipped",
+    "division": lambda runs: (
+        "as published" if runs["controller"].iloc[0].endswith(SUFFIX) else "best equipped"
+    ),
     "settled, %": where("task", "random", cells.share),
     "settling time, s": where("task", "random", cells.settling),
     "overshoot, %": where("task", "random", cells.overshoot),
@@ -56,7 +71,10 @@ def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
         row = {"method": quoted(name)}
         for full, words in ((name, ""), (name + SUFFIX, "as published: ")):
             own = runs[runs["controller"] == full]
-            row |= {words + title: cell(own) if len(own) else MISSING for title, cell in HEADLINE_CELLS.items()}
+            row |= {
+                words + title: cell(own) if len(own) else MISSING
+                for title, cell in HEADLINE_CELLS.items()
+            }
         yield row
 
 
@@ -94,19 +112,28 @@ def rendered_tables(folder: Path) -> dict[str, pd.DataFrame]:
         {"pair": minus(pair)}
         | {f"settling time on `{engine}`, s": cell for engine, cell in move.items()}
         | {f"circle on `{engine}`, mm": cell for engine, cell in circle.items()}
-        for pair, move, circle in zip(pairs, *(each.on_engines(runs, pairs) for each in (MOVES, CIRCLES)), strict=True)
+        for pair, move, circle in zip(
+            pairs, *(each.on_engines(runs, pairs) for each in (MOVES, CIRCLES)), strict=True
+        )
     ]
-    return {"held_out_rendered": pd.DataFrame(beside), "held_out_engines": pd.DataFrame(differences)}
+    return {
+        "held_out_rendered": pd.DataFrame(beside),
+        "held_out_engines": pd.DataFrame(differences),
+    }
 
 
 def study_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the median settling time of each method with the values of each of its tuning studies."""
-    parts = [load_runs(folder / part) for part in TUNING_STUDIES.commands if (folder / part).exists()]
+    parts = [
+        load_runs(folder / part) for part in TUNING_STUDIES.commands if (folder / part).exists()
+    ]
     rows = []
     for name in BOTH:
         own = [part[part["controller"] == name] for part in parts]
         if any(len(each) for each in own):
-            rows.append({"method": quoted(name)} | dict(zip(TITLES, map(cells.settling, own), strict=False)))
+            rows.append(
+                {"method": quoted(name)} | dict(zip(TITLES, map(cells.settling, own), strict=False))
+            )
     return {"held_out_studies": pd.DataFrame(rows, columns=["method", *TITLES])}
 
 
@@ -117,7 +144,11 @@ def with_values_of_study(k: int) -> Callable[[Path], Words]:
         values = {}
         for name in BOTH:
             file = tuned_file(name)
-            studies = tomllib.loads(file.read_text(encoding="utf-8")).get("studies", []) if file.is_file() else []
+            studies = (
+                tomllib.loads(file.read_text(encoding="utf-8")).get("studies", [])
+                if file.is_file()
+                else []
+            )
             if len(studies) > k:
                 values[name] = studies[k]["settings"]
         changes = settings(f"{key}={json.dumps(value)}" for key, value in flatten(values).items())
@@ -129,7 +160,9 @@ def with_values_of_study(k: int) -> Callable[[Path], Words]:
 def without(aid: str | None) -> Words:
     """Return the sweep of all methods that have an aid, without it; of all methods as they are for None."""
     names = [
-        name for name in FIVE if aid is None or getattr(default_config(find_controller(name)).aids, aid) != LESS[aid]
+        name
+        for name in FIVE
+        if aid is None or getattr(default_config(find_controller(name)).aids, aid) != LESS[aid]
     ]
     less = [f"{name}.aids.{aid}={str(LESS[aid]).lower()}" for name in names if aid]
     return sweep("fmu", names, "random,circle", "48000:48100", "--latency", "0.05", *settings(less))
@@ -145,7 +178,9 @@ def aids_tables(folder: Path) -> dict[str, pd.DataFrame]:
         for table, measure in zip(rows.values(), (MOVES, CIRCLES), strict=True):
             found = measure.differences(both, [(name + CHANGED, name) for name in names])
             row = dict.fromkeys(FIVE, "not in use") | dict(zip(names, found, strict=True))
-            table.append({"left out": quoted(aid)} | {quoted(name): cell for name, cell in row.items()})
+            table.append(
+                {"left out": quoted(aid)} | {quoted(name): cell for name, cell in row.items()}
+            )
     return {name: pd.DataFrame(own) for name, own in rows.items()}
 
 
@@ -153,7 +188,10 @@ HELD_OUT = Study(
     "held_out",
     "1,000 held-out robots, every method best equipped and as published",
     10,
-    {"moves": sweep("fmu", BOTH, "random", "40000:41000"), "circles": sweep("fmu", BOTH, "circle", "41000:41100")},
+    {
+        "moves": sweep("fmu", BOTH, "random", "40000:41000"),
+        "circles": sweep("fmu", BOTH, "circle", "41000:41100"),
+    },
     tables,
 )
 RENDERED_STUDY = Study(

@@ -42,7 +42,13 @@ GAIN: Final = 0.2  # [1/s]
 DURATION: Final = 15.0  # [s]
 DISPLACED: Final = 20.0  # [px] by which mixture and bimodal noise is displaced
 SEEDS: Final = "60000:60100"
-LEVELS: Final = {"white": "", "mixture": "0:20:5%", "bimodal": "0:20:5%", "stable": "1:2:0.25", "uniform": ""}
+LEVELS: Final = {
+    "white": "",
+    "mixture": "0:20:5%",
+    "bimodal": "0:20:5%",
+    "stable": "1:2:0.25",
+    "uniform": "",
+}
 """What is varied of each family; theirs were twelve levels between the same bounds."""
 DEVIATIONS: Final = {"stable": math.sqrt(2.0), "uniform": math.sqrt(1.0 / 12.0)}
 """[px] of the families whose deviation is not 1: of scale 1, and of width 1."""
@@ -87,8 +93,14 @@ class Measure(NamedTuple):
 
 
 MEASURES: Final = (
-    Measure("ratio", "RMS error of a run over that with the true Jacobian", (0.95, 1.0, 1.1, 1.2, 1.5)),
-    Measure("jacobian_error_mean", "relative error of the Jacobian", (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)),
+    Measure(
+        "ratio", "RMS error of a run over that with the true Jacobian", (0.95, 1.0, 1.1, 1.2, 1.5)
+    ),
+    Measure(
+        "jacobian_error_mean",
+        "relative error of the Jacobian",
+        (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0),
+    ),
 )
 
 
@@ -98,13 +110,25 @@ def family_sweep(setup: SetUp, family: str) -> Words:
     size = DEVIATIONS.get(family, 1.0) * setup.pixel
     changes = [
         f"random.duration={DURATION:g}",
-        *([] if LEVELS[family] else [f'kinematic.sensing.noise="{family}"']),  # an axis that is varied sets it
+        *(
+            [] if LEVELS[family] else [f'kinematic.sensing.noise="{family}"']
+        ),  # an axis that is varied sets it
         f"kinematic.sensing.feature_noise={size:.6g}",
         f"kinematic.sensing.noise_offset={DISPLACED * setup.pixel:g}",
         *(f"{name}.law.proportional_gain={GAIN:g}" for name in names),
     ]
     vary = ("--vary", f"{family}={LEVELS[family]}") if LEVELS[family] else ()
-    return sweep("kinematic", names, "random", SEEDS, "--mismatch", "none", *vary, *settings(changes), *setup.options)
+    return sweep(
+        "kinematic",
+        names,
+        "random",
+        SEEDS,
+        "--mismatch",
+        "none",
+        *vary,
+        *settings(changes),
+        *setup.options,
+    )
 
 
 def ratios(folder: Path) -> dict[str, pd.DataFrame]:
@@ -115,7 +139,10 @@ def ratios(folder: Path) -> dict[str, pd.DataFrame]:
         runs["estimator"] = runs["controller"].str.removeprefix(f"{LAW}+")
         runs["level"] = runs["magnitude"].fillna(0.0)
         best = runs[runs["estimator"] == REFERENCE].set_index(["level", "seed"])["rms_error"]
-        ratio = runs["rms_error"] / best.loc[list(zip(runs["level"], runs["seed"], strict=True))].to_numpy()
+        ratio = (
+            runs["rms_error"]
+            / best.loc[list(zip(runs["level"], runs["seed"], strict=True))].to_numpy()
+        )
         found[family] = runs.assign(ratio=ratio.where(runs["status"] == COMPLETED, math.inf))
     return found
 
@@ -125,10 +152,20 @@ def tables(setup: SetUp, folder: Path) -> Mapping[str, pd.DataFrame]:
     ratio_rows, error_rows = [], []
     for family, runs in ratios(folder).items():
         for level, own in runs.groupby("level"):
-            place = {"noise": family, "level": f"{level:g} {own['unit'].iloc[0]}".strip() if LEVELS[family] else ""}
-            cells = {name: own[own["estimator"] == name] for name in ESTIMATORS if name != REFERENCE}
-            ratio_rows.append(place | {f"`{name}`": spread(each["ratio"]) for name, each in cells.items()})
-            errors = {f"`{name}`": f"{each['jacobian_error_mean'].median():.2f}" for name, each in cells.items()}
+            place = {
+                "noise": family,
+                "level": f"{level:g} {own['unit'].iloc[0]}".strip() if LEVELS[family] else "",
+            }
+            cells = {
+                name: own[own["estimator"] == name] for name in ESTIMATORS if name != REFERENCE
+            }
+            ratio_rows.append(
+                place | {f"`{name}`": spread(each["ratio"]) for name, each in cells.items()}
+            )
+            errors = {
+                f"`{name}`": f"{each['jacobian_error_mean'].median():.2f}"
+                for name, each in cells.items()
+            }
             error_rows.append(place | errors)
     return {setup.study: pd.DataFrame(ratio_rows), setup.errors: pd.DataFrame(error_rows)}
 
@@ -151,7 +188,8 @@ def boxes(runs: Mapping[str, pd.DataFrame]) -> Figure:
     """Draw box plots over the levels of each family, a colour an estimator: the error, and that of the Jacobian."""
     shown = {name: colour for name, colour in ESTIMATORS.items() if name != REFERENCE}
     rows = {
-        title: {f"{level:g}": own for level, own in runs[family].groupby("level")} for family, title in TITLES.items()
+        title: {f"{level:g}": own for level, own in runs[family].groupby("level")}
+        for family, title in TITLES.items()
     } | {"white and uniform noise": {family: runs[family] for family in ("white", "uniform")}}
     figure = Figure(figsize=(style.WIDTH, 8.0), layout="constrained")
     grid = figure.subplots(len(rows), len(MEASURES), sharey="col")
@@ -166,11 +204,16 @@ def boxes(runs: Mapping[str, pd.DataFrame]) -> Figure:
     return figure
 
 
-def draw_groups(axes: Axes, groups: Mapping[str, pd.DataFrame], shown: Mapping[str, str], measure: Measure) -> None:
+def draw_groups(
+    axes: Axes, groups: Mapping[str, pd.DataFrame], shown: Mapping[str, str], measure: Measure
+) -> None:
     """Draw a group of boxes for each level; whiskers reach from the 5th to the 95th percentile."""
     width = GROUP / len(shown)
     for i, (name, colour) in enumerate(shown.items()):
-        values = [own.loc[own["estimator"] == name, measure.column].clip(upper=1e3) for own in groups.values()]
+        values = [
+            own.loc[own["estimator"] == name, measure.column].clip(upper=1e3)
+            for own in groups.values()
+        ]
         places = np.arange(len(groups)) + (i - (len(shown) - 1) / 2.0) * width
         axes.boxplot(
             values, positions=places, widths=0.8 * width, whis=(5, 95), sym="", manage_ticks=False, patch_artist=True,
@@ -178,7 +221,11 @@ def draw_groups(axes: Axes, groups: Mapping[str, pd.DataFrame], shown: Mapping[s
             capprops={"linewidth": 0.8, "color": colour}, medianprops={"color": "black", "linewidth": 1.0},
         )  # fmt: skip
     axes.set_xticks(range(len(groups)), list(groups))
-    axes.set(yscale="log", ylim=measure.ticks[:: len(measure.ticks) - 1], xlim=(-0.55, len(groups) - 0.45))
+    axes.set(
+        yscale="log",
+        ylim=measure.ticks[:: len(measure.ticks) - 1],
+        xlim=(-0.55, len(groups) - 0.45),
+    )
     axes.set_yticks(measure.ticks, [f"{tick:g}" for tick in measure.ticks])
     axes.minorticks_off()
 

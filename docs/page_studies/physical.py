@@ -27,7 +27,8 @@ from servobench.harness.run.result import COMPLETED
 RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
 NOWHERE: Final = "nowhere"
 PERIODS: Final = ",".join(f"{1.0 / rate:g}" for rate in RATES)
-SHORT: Final = settings(["random.duration=5"])  # [s]; a bullet run costs seconds, and methods settle within three
+# [s]; a bullet run costs seconds, and methods settle within three
+SHORT: Final = settings(["random.duration=5"])
 
 
 def rates_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -35,7 +36,9 @@ def rates_table(folder: Path) -> dict[str, pd.DataFrame]:
 
     What is worse on one engine only is in bold.
     """
-    rows = [row for plant in RATES_STUDY.commands for row in rate_rows(load_runs(folder / plant), plant)]
+    rows = [
+        row for plant in RATES_STUDY.commands for row in rate_rows(load_runs(folder / plant), plant)
+    ]
     table = pd.DataFrame(rows)
     for _, own in table[table["plant"].isin(ENGINES)].groupby("method"):
         if len({worse != NOWHERE for worse in own["worse"]}) > 1:
@@ -47,15 +50,29 @@ def rate_rows(runs: pd.DataFrame, plant: str) -> Iterator[dict[str, str]]:
     """Yield a row for each method on one plant."""
     for name, own in cells.by_method(runs):
         at = {rate: own[np.isclose(own["period_s"], 1.0 / rate)] for rate in RATES}
-        worse = [f"{fast} Hz: {words}" for slow, fast in pairwise(RATES) if (words := loss(at[slow], at[fast]))]
+        worse = [
+            f"{fast} Hz: {words}"
+            for slow, fast in pairwise(RATES)
+            if (words := loss(at[slow], at[fast]))
+        ]
         found = {f"{rate} Hz": count_and_median(each) for rate, each in at.items()}
-        yield {"method": cells.quoted(name), "plant": plant} | found | {"worse": "; ".join(worse) or NOWHERE}
+        yield (
+            {"method": cells.quoted(name), "plant": plant}
+            | found
+            | {"worse": "; ".join(worse) or NOWHERE}
+        )
 
 
 def count_and_median(runs: pd.DataFrame) -> str:
     """Return how many runs settled and their median settling time [s], as in `40, 0.83`."""
     count, middle = cells.settled(runs), median_with_interval(settling_times(runs)).value
-    return f"{count}, {middle:.2f}" if middle < float("inf") else "0" if count == "0" else f"{count}, {MISSING}"
+    return (
+        f"{count}, {middle:.2f}"
+        if middle < float("inf")
+        else "0"
+        if count == "0"
+        else f"{count}, {MISSING}"
+    )
 
 
 def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
@@ -104,7 +121,10 @@ def ends_table(folder: Path) -> dict[str, pd.DataFrame]:
         "target out of reach": cells.counted,
         "error at the end, mm": lambda runs: cells.millimetres(runs, "steady_state_error", 0),
     }
-    singular_start = {"arm stretched at the start": cells.counted, "settling time, s": cells.settling}
+    singular_start = {
+        "arm stretched at the start": cells.counted,
+        "settling time, s": cells.settling,
+    }
     shown = {"unreachable": unreachable, "singular_start": singular_start}
     parts = [cells.rows_by_method(load_runs(folder / part), each) for part, each in shown.items()]
     return {"ends": pd.DataFrame(one | other for one, other in zip(*parts, strict=True))}
@@ -118,7 +138,10 @@ def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
     pairs = {cells.quoted(name): (name + cells.CHANGED, name) for name in RENDERED}
     made: dict[str, list[dict[str, str]]] = {"dynamics": [], "dynamics_circle": []}
     for words, parts in changes.items():
-        both = {engine: cells.changed_and_usual(load_runs(folder / parts[engine]), usual[engine]) for engine in ENGINES}
+        both = {
+            engine: cells.changed_and_usual(load_runs(folder / parts[engine]), usual[engine])
+            for engine in ENGINES
+        }
         for table, measure in zip(made.values(), (cells.MOVES, cells.CIRCLES), strict=True):
             found = dict(zip(pairs, measure.on_engines(both, list(pairs.values())), strict=True))
             for engine in ENGINES:
@@ -157,7 +180,9 @@ RATES_STUDY = Study(
     "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic`, 10 on each physics engine",
     35,
     {"kinematic": sweep("kinematic", BOTH, "random", "52000:52100", "--period", PERIODS)}
-    | on_engines(lambda plant: sweep(plant, RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT)),
+    | on_engines(
+        lambda plant: sweep(plant, RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT)
+    ),
     rates_table,
 )
 LONG = Study(
@@ -165,7 +190,9 @@ LONG = Study(
     "half an hour on the circle and the lemniscate",
     30,
     {
-        curve: sweep("kinematic", BOTH, "endurance", "45000:45010", *settings([f'endurance.curve="{curve}"']))
+        curve: sweep(
+            "kinematic", BOTH, "endurance", "45000:45010", *settings([f'endurance.curve="{curve}"'])
+        )
         for curve in ("circle", "lemniscate")
     },
     long_table,
@@ -174,7 +201,10 @@ ENDS = Study(
     "ends",
     "targets out of reach and starts with the arm stretched",
     2,
-    {task: sweep("kinematic", BOTH, task, "46000:46020") for task in ("unreachable", "singular_start")},
+    {
+        task: sweep("kinematic", BOTH, task, "46000:46020")
+        for task in ("unreachable", "singular_start")
+    },
     ends_table,
 )
 DYNAMICS = Study(

@@ -17,14 +17,17 @@ from servobench.harness.pictures.style import drawing_of
 
 SHOWN = "circle"  # the task whose film gives a frame
 PERIOD = 150  # of the run shown: three quarters of a lap
-FILES = {"errors": "errors", "tracking": "circle", "paths": "paths"}  # kind of figure -> name of its file
+# Kind of figure -> name of its file
+FILES = {"errors": "errors", "tracking": "circle", "paths": "paths"}
 COLOURS = 128  # of a picture's palette
 
 
 def small(picture: Image.Image) -> bytes:
     """Return a picture as PNG with a palette."""
     stream = io.BytesIO()
-    picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
+        stream, "PNG", optimize=True
+    )
     return stream.getvalue()
 
 
@@ -61,5 +64,9 @@ README = Study(
     files=readme_pictures,
 )  # fmt: skip
 PERFORMANCE = Study(
-    "performance", "the page of performance", 20, {"page": ("benchmarks/page.py",)}, files=performance_page
+    "performance",
+    "the page of performance",
+    20,
+    {"page": ("benchmarks/page.py",)},
+    files=performance_page,
 )

@@ -14,13 +14,25 @@ from servobench.harness.analysis.comparison import is_majority, settling_times
 from servobench.harness.batch.results import load_runs
 from servobench.harness.studies.robustness import KNOWN_LINES
 
-MAPPED = ("regression_mfac", *(name + SUFFIX for name in FOUR))  # best equipped all stay above 90 % everywhere
-AXES = "camera_rotation,latency,noise,camera_move"  # those on which methods fail; see the map on `fmu`
+# Best equipped all stay above 90 % everywhere
+MAPPED = ("regression_mfac", *(name + SUFFIX for name in FOUR))
+AXES = (
+    "camera_rotation,latency,noise,camera_move"  # those on which methods fail; see the map on `fmu`
+)
 
 
 def mapping(plant: str, seeds: str, *options: str) -> Words:
     """Return the arguments of a robustness map."""
-    return ("robustness", "--plant", plant, "--controllers", ",".join(MAPPED), "--seeds", seeds, *options)
+    return (
+        "robustness",
+        "--plant",
+        plant,
+        "--controllers",
+        ",".join(MAPPED),
+        "--seeds",
+        seeds,
+        *options,
+    )
 
 
 def map_pictures(folder: Path) -> dict[str, bytes]:
@@ -38,7 +50,9 @@ def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
         title = f"{line.title}: {', '.join(f'{place.number:g}' for place in line.places)}"
         cells = {quoted(name): settled_at_places(own) for name, own in by_method(along)}
         for k, engine in enumerate(ENGINES):
-            rows.append({"axis": title, "plant": engine} | {name: both[k] for name, both in cells.items()})
+            rows.append(
+                {"axis": title, "plant": engine} | {name: both[k] for name, both in cells.items()}
+            )
     return {"robustness_engines": pd.DataFrame(rows)}
 
 
@@ -46,15 +60,24 @@ def settled_at_places(runs: pd.DataFrame) -> list[str]:
     """Return for each engine how many runs of a method settle at each place of an axis."""
     runs = runs.assign(settled=settling_times(runs).notna())
     found = [
-        runs[runs["plant"] == engine].pivot(index="seed", columns="magnitude", values="settled") for engine in ENGINES
+        runs[runs["plant"] == engine].pivot(index="seed", columns="magnitude", values="settled")
+        for engine in ENGINES
     ]
     only = [int((one & ~other).to_numpy().sum()) for one, other in (found, found[::-1])]
     cells = [" ".join(str(count) for count in each.sum()) for each in found]
-    return [marked(cell) for cell in cells] if is_majority(*only) or is_majority(*only[::-1]) else cells
+    return (
+        [marked(cell) for cell in cells]
+        if is_majority(*only) or is_majority(*only[::-1])
+        else cells
+    )
 
 
 MAP = Study(
-    "robustness", "the robustness map: its two pictures", 2, {"map": mapping("fmu", "50000:50030")}, files=map_pictures
+    "robustness",
+    "the robustness map: its two pictures",
+    2,
+    {"map": mapping("fmu", "50000:50030")},
+    files=map_pictures,
 )
 MAP_ENGINES = Study(
     "robustness_engines",

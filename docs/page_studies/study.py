@@ -13,14 +13,17 @@ from servobench.controllers.methods import METHODS
 from servobench.controllers.methods import PUBLISHED as SUFFIX
 
 Tables: TypeAlias = Mapping[str, pd.DataFrame]  # text cells, by name of the table
-Words: TypeAlias = tuple[str, ...]  # arguments of `servobench`, or a script of this project and its arguments
+# Arguments of `servobench`, or a script of this project and its arguments
+Words: TypeAlias = tuple[str, ...]
 Command: TypeAlias = Words | Callable[[Path], Words]
 ENGINES: Final = ("bullet", "mujoco")
 BETTER: Final = "regression_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper
 FIVE: Final = (BETTER, *FOUR)
-PUBLISHED: Final = tuple(name for name in METHODS if name.endswith(SUFFIX))  # without any aid, the law as printed
-EQUIPPED: Final = tuple(name for name in METHODS if name not in PUBLISHED)  # with all aids that help it
+# Without any aid, the law as printed
+PUBLISHED: Final = tuple(name for name in METHODS if name.endswith(SUFFIX))
+# With all aids that help it
+EQUIPPED: Final = tuple(name for name in METHODS if name not in PUBLISHED)
 BOTH: Final = EQUIPPED + PUBLISHED
 RENDERED: Final = (*FIVE, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in FIVE))
 
@@ -55,7 +58,18 @@ class Study:
 def sweep(plants: str, controllers: Iterable[str], tasks: str, seeds: str, *options: str) -> Words:
     """Return the arguments of a sweep."""
     names = ",".join(controllers)
-    return ("sweep", "--plants", plants, "--controllers", names, "--tasks", tasks, "--seeds", seeds, *options)
+    return (
+        "sweep",
+        "--plants",
+        plants,
+        "--controllers",
+        names,
+        "--tasks",
+        tasks,
+        "--seeds",
+        seeds,
+        *options,
+    )
 
 
 def settings(assignments: Iterable[str]) -> Words:
@@ -68,4 +82,6 @@ def on_engines(command: Callable[[str], Words]) -> dict[str, Words]:
 
     Table and floor are left out of the images: the observations are the same, bit for bit.
     """
-    return {engine: (*command(engine), *settings([f"{engine}.scenery=false"])) for engine in ENGINES}
+    return {
+        engine: (*command(engine), *settings([f"{engine}.scenery=false"])) for engine in ENGINES
+    }

@@ -26,6 +26,7 @@ MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
 FRESH = "140428:140628"  # from the hash of the last commit that changed code before they were drawn
 _UKF = {"aids.model": "nominal", "estimator.walk": "1e-12", "estimator.initial_deviation": "1e-12"}
+# Settings without which a method keeps the Jacobian of the nominal model
 FROZEN: Final[Mapping[str, Mapping[str, str]]] = {
     "regression_mfac": {"aids.model": "nominal"},
     "ukf_mfac": _UKF,
@@ -33,17 +34,25 @@ FROZEN: Final[Mapping[str, Mapping[str, str]]] = {
     "rbf_pid": {"aids.model": "nominal", "estimator.n2": "1e-12", "estimator.n3": "1e-12"},
     "rbfnn_mfac": {"aids.model": "nominal", "estimator.k2": "1e-9"},
     "broyden": {"aids.model": "nominal", "estimator.step_factor": "1e-9"},
-    "rls": {"aids.model": "nominal", "estimator.initial_covariance": "1e-12", "estimator.memory": "1000"},
+    "rls": {
+        "aids.model": "nominal",
+        "estimator.initial_covariance": "1e-12",
+        "estimator.memory": "1000",
+    },
     "cfdl_mfac": {"aids.model": "nominal", "estimator.step_factor": "1e-9"},
-}  # settings without which a method keeps the Jacobian of the nominal model
+}
 
 
 def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how many of 100 robots settle in each world, a row a method."""
     runs = pd.concat(load_runs(folder / part) for part in WORLDS.commands)
-    late = [f", latency of {1e3 * each:g} ms" if pd.notna(each) else "" for each in runs["latency_s"]]
+    late = [
+        f", latency of {1e3 * each:g} ms" if pd.notna(each) else "" for each in runs["latency_s"]
+    ]
     runs["world"] = runs["mismatch"].map(cells.quoted) + late
-    shown = {world: cells.where("world", world, cells.settled) for world in dict.fromkeys(runs["world"])}
+    shown = {
+        world: cells.where("world", world, cells.settled) for world in dict.fromkeys(runs["world"])
+    }
     return {"worlds": pd.DataFrame(cells.rows_by_method(runs, shown))}
 
 
@@ -71,11 +80,17 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
     for (grade, name), runs in methods.groupby(["grade", "challenge"], sort=False):
         own = runs.set_index("controller")
         unit = "s" if own["measure"].iloc[0] == "settling" else "mm"
-        row = {"challenge": f"`{name}`", "grade": grade, "reference": f"{own['reference'].iloc[0]:.2f} {unit}"}
+        row = {
+            "challenge": f"`{name}`",
+            "grade": grade,
+            "reference": f"{own['reference'].iloc[0]:.2f} {unit}",
+        }
         for method in FIVE:
             row[cells.quoted(method)] = scored(own.loc[method])
         best = own.loc[[name for name in RENDERED if name.endswith(SUFFIX)]]["score"].idxmax()
-        row["best as published"] = f"{cells.quoted(best.removesuffix(SUFFIX))} {scored(own.loc[best])}"
+        row["best as published"] = (
+            f"{cells.quoted(best.removesuffix(SUFFIX))} {scored(own.loc[best])}"
+        )
         rows.append(row)
     ranking = pd.read_csv(folder / "runs" / "ranking.csv")
     ranked = [
@@ -84,18 +99,31 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
          "lost, %": f"{each['lost, %']:.0f}", **{key: f"{each[key]:.2f}" for key in ranking if "within" in key}}
         for _, each in ranking.iterrows()
     ]  # fmt: skip
-    return {"challenges": pd.DataFrame(rows).sort_values("grade", kind="stable"), "ranking": pd.DataFrame(ranked)}
+    return {
+        "challenges": pd.DataFrame(rows).sort_values("grade", kind="stable"),
+        "ranking": pd.DataFrame(ranked),
+    }
 
 
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how the runs of every pair of law and estimator ended."""
-    shown = {"runs": lambda runs: str(len(runs)), "settled": cells.settled, "ended early": cells.ended_early}
-    return {"pairs": pd.DataFrame(cells.rows_by_method(load_runs(folder / "pairs"), shown, title="pair"))}
+    shown = {
+        "runs": lambda runs: str(len(runs)),
+        "settled": cells.settled,
+        "ended early": cells.ended_early,
+    }
+    return {
+        "pairs": pd.DataFrame(
+            cells.rows_by_method(load_runs(folder / "pairs"), shown, title="pair")
+        )
+    }
 
 
 def path_ratio(runs: pd.DataFrame) -> str:
     """Return the median ratio of the path of the features to the straight one, with its interval."""
-    return cells.short(median_with_interval(column_of(runs, "path_length_ratio"), missing="left_out"), 2)
+    return cells.short(
+        median_with_interval(column_of(runs, "path_length_ratio"), missing="left_out"), 2
+    )
 
 
 def in_view(runs: pd.DataFrame) -> str:
@@ -113,7 +141,10 @@ def sensing_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return a table for each measure, with a row for each method and a column for each sensing set-up."""
     runs, tables = load_runs(folder / "runs"), {}
     for name, cell in SENSING_CELLS.items():
-        shown = {cells.quoted(each): cells.where("sensing", each, cell) for each in dict.fromkeys(runs["sensing"])}
+        shown = {
+            cells.quoted(each): cells.where("sensing", each, cell)
+            for each in dict.fromkeys(runs["sensing"])
+        }
         tables[name] = pd.DataFrame(cells.rows_by_method(runs, shown))
     return tables
 
@@ -132,7 +163,9 @@ WORLDS = Study(
     {
         "worse": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", ",".join(MISMATCHES)),
         "late": sweep("fmu", BOTH, "random", SEEDS, "--latency", "0.05,0.1"),
-        "moved": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", MOVED, "--set", "random.duration=16"),
+        "moved": sweep(
+            "fmu", BOTH, "random", SEEDS, "--mismatch", MOVED, "--set", "random.duration=16"
+        ),
     },
     worlds_table,
 )
@@ -142,7 +175,10 @@ LEARNING = Study(
     10,
     {
         "learning": LEARNING_SUITE,
-        "frozen": (*LEARNING_SUITE, *settings(f"{key}={value}" for key, value in flatten(FROZEN).items())),
+        "frozen": (
+            *LEARNING_SUITE,
+            *settings(f"{key}={value}" for key, value in flatten(FROZEN).items()),
+        ),
     },
     learning_table,
 )

@@ -96,13 +96,17 @@ class Traced(NDArrayOperatorsMixin):
         outputs = options.pop("out", None)
         options.pop("dtype", None)
         if all(not isinstance(each, Traced) or each.constant for each in inputs):
-            result = getattr(ufunc, method)(*map(as_numbers, inputs), **_plain_options(options, outputs))
+            result = getattr(ufunc, method)(
+                *map(as_numbers, inputs), **_plain_options(options, outputs)
+            )
         elif method == "__call__":
             result = _called(ufunc, inputs, options, outputs)
         elif method == "reduce":
             result = reduced(ufunc.__name__, inputs[0], **options)
         else:
-            raise NotTraceable(f"it calls numpy.{ufunc.__name__}.{method}, which has no exported form")
+            raise NotTraceable(
+                f"it calls numpy.{ufunc.__name__}.{method}, which has no exported form"
+            )
         if outputs is None:
             return result
         if not isinstance(outputs[0], Traced):
@@ -155,7 +159,9 @@ class Traced(NDArrayOperatorsMixin):
             self.buffer.content = self.buffer.content.copy()
             self.buffer.content[places] = as_numbers(value)
         else:
-            content = casadi.MX(casadi.DM(self.buffer.content) if self.constant else self.buffer.content)
+            content = casadi.MX(
+                casadi.DM(self.buffer.content) if self.constant else self.buffer.content
+            )
             content.nz[places.reshape(-1).tolist()] = spread(as_traced(value), places.shape).flat()
             self.buffer.content = content
 
@@ -165,7 +171,11 @@ class Traced(NDArrayOperatorsMixin):
 
     def copy(self) -> Traced:
         """Return a copy with a buffer of its own."""
-        return Traced.plain(self.numbers()) if self.constant else Traced.of(self.flat(), self.shape, self.kind)
+        return (
+            Traced.plain(self.numbers())
+            if self.constant
+            else Traced.of(self.flat(), self.shape, self.kind)
+        )
 
     def astype(self, dtype: npt.DTypeLike) -> Traced:
         """Return the numbers as another type; numbers are truncated to whole ones."""
@@ -241,7 +251,10 @@ def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> 
     """Return arrays as one: `arrange` puts the tables of their places together as numpy would the arrays."""
     parts = [as_traced(array) for array in arrays]
     ends = np.cumsum([0, *(part.size for part in parts)])
-    tables = [first + np.arange(part.size).reshape(part.shape) for first, part in zip(ends, parts, strict=False)]
+    tables = [
+        first + np.arange(part.size).reshape(part.shape)
+        for first, part in zip(ends, parts, strict=False)
+    ]
     kind = max((part.kind for part in parts), key="bif".index)
     content = casadi.vertcat(*(part.flat() for part in parts))
     return Traced(Buffer(content), arrange(tables), kind)
@@ -275,8 +288,19 @@ COMPARISONS: Mapping[str, Operation] = {
     "isfinite": lambda x: casadi.fabs(x) <= MAX_FLOAT,
     "isnan": lambda x: casadi.logic_not(casadi.fabs(x) <= np.inf),
 }  # fmt: skip
-OF_TRUTH: Mapping[str, str] = {"bitwise_and": "logical_and", "bitwise_or": "logical_or", "invert": "logical_not"}
-FROM_TRUTH = {"add": 0.0, "multiply": 1.0, "maximum": -np.inf, "minimum": np.inf, "logical_or": 0.0, "logical_and": 1.0}
+OF_TRUTH: Mapping[str, str] = {
+    "bitwise_and": "logical_and",
+    "bitwise_or": "logical_or",
+    "invert": "logical_not",
+}
+FROM_TRUTH = {
+    "add": 0.0,
+    "multiply": 1.0,
+    "maximum": -np.inf,
+    "minimum": np.inf,
+    "logical_or": 0.0,
+    "logical_and": 1.0,
+}
 
 
 def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]:  # noqa: ANN401 - as numpy's
@@ -287,7 +311,12 @@ def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]: 
     return numbers
 
 
-def _called(ufunc: np.ufunc, inputs: Sequence[Any], options: Mapping[str, Any], outputs: Any) -> Traced:  # noqa: ANN401
+def _called(
+    ufunc: np.ufunc,
+    inputs: Sequence[Any],
+    options: Mapping[str, Any],
+    outputs: Any,  # noqa: ANN401
+) -> Traced:
     name = ufunc.__name__
     if name in PRODUCTS:
         return PRODUCTS[name](*map(as_traced, inputs))
@@ -329,33 +358,51 @@ def choose(chosen: Any, one: Any, other: Any) -> Traced:  # noqa: ANN401 - anyth
     return mapped(casadi.if_else, arrays, kind)
 
 
-def reduced(name: str, array: Any, axis: Any = 0, keepdims: bool = False, initial: Any = None) -> Traced:  # noqa: ANN401
+def reduced(
+    name: str,
+    array: Any,  # noqa: ANN401
+    axis: Any = 0,  # noqa: ANN401
+    keepdims: bool = False,
+    initial: Any = None,  # noqa: ANN401
+) -> Traced:
     """Return the reduction by a ufunc of its name over axes, None for all."""
     if name in OF_TRUTH:
         name = OF_TRUTH[name]
     if name not in FROM_TRUTH:
         raise NotTraceable(f"it calls numpy.{name}.reduce, which has no exported form")
     table = as_traced(array)
-    axes = tuple(range(table.ndim)) if axis is None else (axis,) if isinstance(axis, int) else tuple(axis)
+    axes = (
+        tuple(range(table.ndim))
+        if axis is None
+        else (axis,)
+        if isinstance(axis, int)
+        else tuple(axis)
+    )
     axes = tuple(each % table.ndim for each in axes)
     kept = tuple(size for i, size in enumerate(table.shape) if i not in axes)
     length = int(np.prod([table.shape[i] for i in axes]))
     count = int(np.prod(kept))
-    last = table.arranged(np.moveaxis(table.places, axes, range(-len(axes), 0)).reshape(count, length))
+    last = table.arranged(
+        np.moveaxis(table.places, axes, range(-len(axes), 0)).reshape(count, length)
+    )
     kind = "b" if name.startswith("logical") else "i" if table.kind in "bi" else "f"
     operation = ARITHMETIC.get(name) or COMPARISONS[name]
     result: Expression
     if name == "add" and length:
         result = casadi.vec(casadi.sum1(casadi.reshape(last.flat(), length, count)))
     else:
-        result = last[:, 0].flat() if length else casadi.MX(casadi.DM(np.full(count, FROM_TRUTH[name])))
+        result = (
+            last[:, 0].flat() if length else casadi.MX(casadi.DM(np.full(count, FROM_TRUTH[name])))
+        )
         for j in range(1, length):
             result = operation(result, last[:, j].flat())
     if name.startswith("logical") and length == 1:
         result = result != 0.0
     if initial is not None:
         result = operation(result, float(initial))
-    shape = tuple(1 if i in axes else size for i, size in enumerate(table.shape)) if keepdims else kept
+    shape = (
+        tuple(1 if i in axes else size for i, size in enumerate(table.shape)) if keepdims else kept
+    )
     return Traced.of(result, shape, kind)
 
 
@@ -369,7 +416,10 @@ def matmul(a: Traced, b: Traced) -> Traced:
     if b.shape[-2] != k:
         raise ValueError(f"matmul: {a.shape} does not fit {b.shape}")
     lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    left, right = spread(a, (*lead, i, k)).reshape(-1, i, k), spread(b, (*lead, k, j)).reshape(-1, k, j)
+    left, right = (
+        spread(a, (*lead, i, k)).reshape(-1, i, k),
+        spread(b, (*lead, k, j)).reshape(-1, k, j),
+    )
     if 0 in (i, j, k) or len(left) == 0:
         return Traced.of(casadi.MX.zeros(int(np.prod((*lead, i, j))), 1), (*lead, i, j))
     # Row-major entries are the column-major ones of the transpose, and (A B)ᵀ = Bᵀ Aᵀ.

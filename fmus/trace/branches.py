@@ -27,7 +27,9 @@ _NUMBERS = count()
 class Frame:
     """The faults of a function that is being recorded."""
 
-    code: Expression = field(default_factory=lambda: casadi.MX(0.0))  # of the worst one, an expression
+    code: Expression = field(
+        default_factory=lambda: casadi.MX(0.0)
+    )  # of the worst one, an expression
 
 
 _FRAMES: list[Frame] = []
@@ -120,16 +122,25 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
     return with_leaves(tree, merged)
 
 
-def _side_by_side(chosen: Traced, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
+def _side_by_side(
+    chosen: Traced,
+    function: Callable[..., Tree],
+    tree: Tree,
+    *arguments: Any,  # noqa: ANN401
+) -> Tree:
     """Return the results of `branch` for each lane by itself."""
     results = [
         branch(chosen[lane], function, take(tree, lane), *(take(each, lane) for each in arguments))
         for lane in np.ndindex(chosen.shape)
     ]
-    return map_arrays(lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results)
+    return map_arrays(
+        lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results
+    )
 
 
-def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int) -> Tree:
+def repeat(
+    condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int
+) -> Tree:
     """Apply a function for as long as a condition holds; see `servobench.plant.contract.lanes.repeat`.
 
     One pass is recorded and called `at_most` times.
@@ -146,7 +157,9 @@ def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], t
         *columns, code = once(*columns)
         note_code(code)
     shown = zip(columns, after, strict=True)
-    return with_leaves(tree, [Traced.of(column, np.shape(leaf), as_traced(leaf).kind) for column, leaf in shown])
+    return with_leaves(
+        tree, [Traced.of(column, np.shape(leaf), as_traced(leaf).kind) for column, leaf in shown]
+    )
 
 
 def _function(function: Any, inputs: list[Any], outputs: list[Any]) -> Any:  # noqa: ANN401 - of CasADi

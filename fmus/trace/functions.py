@@ -25,7 +25,9 @@ from servobench.fmus.trace.arrays import (
 )
 from servobench.fmus.trace.branches import NOT_DEFINITE, note_fault
 
-SWEEPS: Final = 10  # sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors
+SWEEPS: Final = (
+    10  # sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors
+)
 ARRANGES: Final = frozenset(
     {
         np.reshape, np.swapaxes, np.moveaxis, np.transpose, np.diagonal, np.repeat, np.broadcast_to, np.flip,
@@ -35,14 +37,19 @@ ARRANGES: Final = frozenset(
 """Functions that rearrange entries: they apply to the table of places as to the numbers."""
 
 
-def carry_out(function: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def carry_out(
+    function: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any]
+) -> Any:  # noqa: ANN401
     """Carry out a function of numpy with at least one array of expressions among its arguments.
 
     Raises:
         NotTraceable: it has no expression.
     """
     if not _has_expressions([arguments, options]):
-        return function(*map(as_numbers, arguments), **{name: as_numbers(value) for name, value in options.items()})
+        return function(
+            *map(as_numbers, arguments),
+            **{name: as_numbers(value) for name, value in options.items()},
+        )
     if function in ARRANGES:
         first, *rest = arguments
         return first.arranged(function(first.places, *rest, **options))
@@ -55,7 +62,13 @@ def carry_out(function: Callable[..., Any], arguments: Sequence[Any], options: M
 def _has_expressions(value: Any) -> bool:  # noqa: ANN401 - any tree
     if isinstance(value, Traced):
         return not value.constant
-    values = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    values = (
+        value.values()
+        if isinstance(value, Mapping)
+        else value
+        if isinstance(value, (list, tuple))
+        else ()
+    )
     return any(_has_expressions(each) for each in values)
 
 
@@ -118,7 +131,9 @@ def _take(array: Any, indices: Any, axis: int | None = None, **options: Any) -> 
     if not isinstance(indices, Traced) or indices.constant:
         return table.arranged(np.take(table.places, np.asarray(indices), axis=axis, **options))
     if axis not in {None, 0}:
-        raise NotTraceable("it takes entries along an inner axis by an index that is known in the run only")
+        raise NotTraceable(
+            "it takes entries along an inner axis by an index that is known in the run only"
+        )
     return (table.reshape(-1) if axis is None else table)[indices]
 
 
@@ -138,21 +153,29 @@ def _clip(array: Any, a_min: Any = None, a_max: Any = None, **bounds: Any) -> Tr
 
 def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     one, other = as_traced(a), as_traced(b)
-    product: Traced = np.vecdot(one, other) if one.ndim == 1 == other.ndim else np.matmul(one, other)
+    product: Traced = (
+        np.vecdot(one, other) if one.ndim == 1 == other.ndim else np.matmul(one, other)
+    )
     return product
 
 
 def _cross(a: Any, b: Any, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
     one, other = (as_traced(np.moveaxis(each, axis, -1)) for each in (a, b))
     if {one.shape[-1], other.shape[-1]} != {3}:
-        raise NotTraceable("it calls numpy.cross, of which only products of three numbers each have an exported form")
-    product = one[..., [1, 2, 0]] * other[..., [2, 0, 1]] - one[..., [2, 0, 1]] * other[..., [1, 2, 0]]
+        raise NotTraceable(
+            "it calls numpy.cross, of which only products of three numbers each have an exported form"
+        )
+    product = (
+        one[..., [1, 2, 0]] * other[..., [2, 0, 1]] - one[..., [2, 0, 1]] * other[..., [1, 2, 0]]
+    )
     return as_traced(np.moveaxis(product, -1, axis))
 
 
 def _einsum(subscripts: str, a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     if subscripts != "...i,...j->...ij":
-        raise NotTraceable(f'it calls numpy.einsum("{subscripts}"), of which only products a bᵀ have an exported form')
+        raise NotTraceable(
+            f'it calls numpy.einsum("{subscripts}"), of which only products a bᵀ have an exported form'
+        )
     return elementwise("multiply", as_traced(a)[..., :, None], as_traced(b)[..., None, :])
 
 
@@ -170,10 +193,18 @@ def each_matrix(function: Callable[..., tuple[Any, ...]], *arrays: Traced) -> li
         arrays: (..., m, n).
     """
     lead = np.broadcast_shapes(*(array.shape[:-2] for array in arrays))
-    stacks = (spread(array, (*lead, *array.shape[-2:])).reshape(-1, *array.shape[-2:]) for array in arrays)
+    stacks = (
+        spread(array, (*lead, *array.shape[-2:])).reshape(-1, *array.shape[-2:]) for array in arrays
+    )
     results = [function(*map(_matrix, matrices)) for matrices in zip(*stacks, strict=True)]
-    columns = (casadi.vertcat(*(casadi.vec(one.T) for one in stack)) for stack in zip(*results, strict=True))
-    return [Traced.of(column, (*lead, *first.shape)) for column, first in zip(columns, results[0], strict=True)]
+    columns = (
+        casadi.vertcat(*(casadi.vec(one.T) for one in stack))
+        for stack in zip(*results, strict=True)
+    )
+    return [
+        Traced.of(column, (*lead, *first.shape))
+        for column, first in zip(columns, results[0], strict=True)
+    ]
 
 
 def _matrix(array: Traced) -> Expression:
@@ -248,7 +279,9 @@ def svd(a: Any, full_matrices: bool = True, compute_uv: bool = True) -> Svd | Tr
     table = as_traced(a)
     m, n = table.shape[-2:]
     if full_matrices and compute_uv and m != n:
-        raise NotTraceable("it calls numpy.linalg.svd of a matrix that is not square without full_matrices=False")
+        raise NotTraceable(
+            "it calls numpy.linalg.svd of a matrix that is not square without full_matrices=False"
+        )
     function = _svd(max(m, n), min(m, n))
     if m >= n:
         U, values, V = each_matrix(function, table)
@@ -277,7 +310,9 @@ def _sweep(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasA
         c, s = _rotation(own[p], own[q])
         for part in (own, turned):
             part[p], part[q] = c * part[p] - s * part[q], s * part[p] + c * part[q]
-    return casadi.Function(f"sweep_{rows}_{columns}", [A, V], [casadi.horzcat(*own), casadi.horzcat(*turned)])
+    return casadi.Function(
+        f"sweep_{rows}_{columns}", [A, V], [casadi.horzcat(*own), casadi.horzcat(*turned)]
+    )
 
 
 def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
@@ -289,20 +324,30 @@ def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of Cas
         swapped = sizes[p] < sizes[q]
         for part in (own, turned, sizes):
             one, other = part[p], part[q]
-            part[p], part[q] = casadi.if_else(swapped, other, one), casadi.if_else(swapped, one, other)
-    left = [casadi.if_else(size > 0.0, column / size, 0.0) for column, size in zip(own, sizes, strict=True)]
+            part[p], part[q] = (
+                casadi.if_else(swapped, other, one),
+                casadi.if_else(swapped, one, other),
+            )
+    left = [
+        casadi.if_else(size > 0.0, column / size, 0.0)
+        for column, size in zip(own, sizes, strict=True)
+    ]
     if rows == columns == 3:  # a rotation also where the least value is only a rounding error
         across = casadi.cross(left[0], left[1])
         left[2] = casadi.if_else(casadi.dot(across, left[2]) < 0.0, -across, across)
     outputs = [casadi.horzcat(*left), casadi.vertcat(*sizes), casadi.horzcat(*turned)]
-    return casadi.Function(f"sorted_{rows}_{columns}", [A, V], [casadi.densify(each) for each in outputs])
+    return casadi.Function(
+        f"sorted_{rows}_{columns}", [A, V], [casadi.densify(each) for each in outputs]
+    )
 
 
 def _rotation(one: Expression, other: Expression) -> tuple[Expression, Expression]:
     """Return cosine and sine of the rotation that makes two columns orthogonal."""
     product = casadi.dot(one, other)
     zeta = (casadi.sumsqr(other) - casadi.sumsqr(one)) / (2.0 * product)
-    t = casadi.if_else(zeta >= 0.0, 1.0, -1.0) / (casadi.fabs(zeta) + casadi.sqrt(1.0 + zeta * zeta))
+    t = casadi.if_else(zeta >= 0.0, 1.0, -1.0) / (
+        casadi.fabs(zeta) + casadi.sqrt(1.0 + zeta * zeta)
+    )
     t = casadi.if_else(product == 0.0, 0.0, t)
     c = 1.0 / casadi.sqrt(1.0 + t * t)
     return c, c * t

@@ -54,7 +54,11 @@ class _Numpy:
     @staticmethod
     def array(value: Any, dtype: Any = None, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
         same = _Numpy.asarray(value, dtype)
-        return same.copy() if isinstance(same, Traced) else np.array(value, dtype=_real(dtype), **options)
+        return (
+            same.copy()
+            if isinstance(same, Traced)
+            else np.array(value, dtype=_real(dtype), **options)
+        )
 
     @staticmethod
     def ascontiguousarray(value: Any) -> Any:  # noqa: ANN401 - as numpy's
@@ -78,11 +82,15 @@ class _Numpy:
 
     @staticmethod
     def take(array: Any, indices: Any, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
-        return np.take(as_traced(array) if isinstance(indices, Traced) else array, indices, **options)
+        return np.take(
+            as_traced(array) if isinstance(indices, Traced) else array, indices, **options
+        )
 
     @staticmethod
     def broadcast_to(array: Any, shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
-        return spread(as_traced(array), tuple(np.atleast_1d(shape)) if isinstance(shape, int) else shape)
+        return spread(
+            as_traced(array), tuple(np.atleast_1d(shape)) if isinstance(shape, int) else shape
+        )
 
 
 def _real(dtype: Any) -> Any:  # noqa: ANN401 - as numpy's
@@ -109,7 +117,9 @@ def recording() -> Iterator[None]:
                     continue
                 space = vars(module)
                 for key, value in list(space.items()):
-                    unmemoised = value.__wrapped__ if isinstance(value, _lru_cache_wrapper) else None
+                    unmemoised = (
+                        value.__wrapped__ if isinstance(value, _lru_cache_wrapper) else None
+                    )
                     new = meanings.get(id(value), unmemoised)  # a memo must not keep expressions
                     if new is not None:
                         changed.append((space, key, value))
@@ -153,19 +163,25 @@ def record(
     try:
         own = deepcopy(system)
     except TypeError as error:
-        raise NotTraceable("it holds something that is no formula, such as a solver; take another law") from error
+        raise NotTraceable(
+            "it holds something that is no formula, such as a solver; take another law"
+        ) from error
     try:
         with recording():
             values, u = _inputs(inputs)
             with frame() as faults:
                 first = start(own, values)
-            begin = casadi.Function("controller_start", [u], [_column(first), faults.code], {"cse": True})
+            begin = casadi.Function(
+                "controller_start", [u], [_column(first), faults.code], {"cse": True}
+            )
             return Recorded(begin, _recorded_step(own, step, inputs, first))
     except NotTraceable as error:
         raise NotTraceable(f"{_where_it_failed(error)}: {error}") from error
     except RuntimeError as error:  # raised by CasADi
         said = str(error).partition("\n")[0]
-        raise NotTraceable(f"{_where_it_failed(error)}: CasADi cannot express it ({said})") from error
+        raise NotTraceable(
+            f"{_where_it_failed(error)}: CasADi cannot express it ({said})"
+        ) from error
 
 
 def _recorded_step(
@@ -210,6 +226,8 @@ def _where_it_failed(error: BaseException) -> str:
     own = Path(__file__).parent
     for place, _ in walk_tb(error.__traceback__):
         code = place.f_code
-        if Path(code.co_filename).parent != own and "servobench" in str(place.f_globals.get("__name__", "")):
+        if Path(code.co_filename).parent != own and "servobench" in str(
+            place.f_globals.get("__name__", "")
+        ):
             found = f"{code.co_qualname} in {inspect.getmodulename(code.co_filename)}"
     return found

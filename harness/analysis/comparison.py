@@ -22,7 +22,14 @@ from numpy.typing import ArrayLike
 
 from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.run.metrics import METRICS
-from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
+from servobench.harness.run.outcome import (
+    ACHIEVED,
+    FOLLOWED,
+    FOLLOWING_BANDS,
+    NOT_FOLLOWED,
+    NOT_SETTLED,
+    SETTLED,
+)
 from servobench.harness.run.request import RunSettings, varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -31,8 +38,12 @@ from servobench.plant.contract.faults import ConfigurationError
 
 CONFIDENCE: Final = 0.95
 ALPHA: Final = 0.05  # of each one-sided test
-MIN_PAIRS: Final = 6  # least number of equal signs that a two-sided sign test distinguishes from chance at 5 %
-LOST_MARGIN: Final = 0.03  # difference in the share of lost runs up to which methods may be equivalent
+MIN_PAIRS: Final = (
+    6  # least number of equal signs that a two-sided sign test distinguishes from chance at 5 %
+)
+LOST_MARGIN: Final = (
+    0.03  # difference in the share of lost runs up to which methods may be equivalent
+)
 Verdict = Literal["better", "equivalent", "worse", "undecided"]
 RESAMPLES: Final = 2000
 DRAWN_AT_ONCE: Final = 1_000_000  # values of resamples in memory; the same are drawn for any number
@@ -100,7 +111,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
         difference = np.round(one - other, 12)  # ±∞ where one is lost, NaN where both are
     count, sign = len(difference), np.where(np.isnan(difference), 0.0, np.sign(difference))
     mean = mean_with_interval(difference[np.isfinite(difference)])
-    more, fewer = (int(np.count_nonzero(each)) for each in (difference == np.inf, difference == -np.inf))
+    more, fewer = (
+        int(np.count_nonzero(each)) for each in (difference == np.inf, difference == -np.inf)
+    )
     verdict: Verdict = "undecided"
     if is_majority(more, fewer) or is_majority(fewer, more):
         verdict = "worse" if more > fewer else "better"
@@ -109,7 +122,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
     elif mean.count >= MIN_PAIRS and max(-mean.low, mean.high) <= margin:
         verdict = "equivalent" if abs(more - fewer) <= LOST_MARGIN * count else "undecided"
     lost = int(np.isinf(one).sum()), int(np.isinf(other).sum())
-    return Difference(mean, _wilson(0.5 - 0.5 * float(sign.sum()) / max(count, 1), count), lost, verdict)
+    return Difference(
+        mean, _wilson(0.5 - 0.5 * float(sign.sum()) / max(count, 1), count), lost, verdict
+    )
 
 
 def is_majority(ones: int, others: int) -> bool:
@@ -141,11 +156,15 @@ def success_rate(successes: int, runs: int) -> Estimate:
         ValueError: no run, or more successes than runs.
     """
     if not 0 <= successes <= runs or runs < 1:
-        raise ValueError(f"successes must be from 0 to runs, and runs at least 1; got {successes} of {runs}")
+        raise ValueError(
+            f"successes must be from 0 to runs, and runs at least 1; got {successes} of {runs}"
+        )
     return _wilson(successes / runs, runs)
 
 
-def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "left_out"] = "infinite") -> Estimate:
+def median_with_interval(
+    values: ArrayLike, *, missing: Literal["infinite", "left_out"] = "infinite"
+) -> Estimate:
     """Return the median with its percentile bootstrap interval.
 
     BCa is not used: its jackknife is degenerate for a median. The interval may reach to +∞, and does where that many
@@ -182,7 +201,8 @@ def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "lef
             method="percentile", rng=np.random.default_rng(0),
         ).bootstrap_distribution  # fmt: skip
     medians = restored(np.sort(drawn))
-    cut = int((1.0 - CONFIDENCE) / 2.0 * RESAMPLES)  # order statistics, as nothing lies between a number and infinity
+    # Order statistics, as nothing lies between a number and infinity
+    cut = int((1.0 - CONFIDENCE) / 2.0 * RESAMPLES)
     return Estimate(value, float(medians[cut]), float(medians[-1 - cut]), len(sample))
 
 
@@ -217,7 +237,10 @@ def _wilson(share: float, count: int) -> Estimate:
     if count == 0:
         return NO_ESTIMATE
     z = NormalDist().inv_cdf((1.0 + CONFIDENCE) / 2.0)
-    centre, reach = share + z * z / (2.0 * count), z * (share * (1.0 - share) / count + (0.5 * z / count) ** 2) ** 0.5
+    centre, reach = (
+        share + z * z / (2.0 * count),
+        z * (share * (1.0 - share) / count + (0.5 * z / count) ** 2) ** 0.5,
+    )
     low, high = ((centre + side * reach) / (1.0 + z * z / count) for side in (-1.0, 1.0))
     return Estimate(share, max(low, 0.0), min(high, 1.0), count)
 
@@ -249,12 +272,16 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     for key, group in runs.groupby(known, sort=False, dropna=False):
         values: dict[str, Any] = dict(zip(known, key, strict=True))
         words = f"{values['task']} on {place_name(values['plant'], values.get('sensing'))}, {values['mismatch']}"
-        if abs(values.get("noise_factor", 1.0) - 1.0) > 0.0:  # NaN: a row of a table without this column
+        if (
+            abs(values.get("noise_factor", 1.0) - 1.0) > 0.0
+        ):  # NaN: a row of a table without this column
             words += f", noise × {values['noise_factor']:g}"
         for name, (heading, factor) in varied.items():
             if name != "noise_factor" and not pd.isna(values[name]):
                 quantity, _, unit = heading.removesuffix("]").partition(" [")
-                words += f", {quantity} {shown_value(values[name], factor)}{f' {unit}' * bool(unit)}"
+                words += (
+                    f", {quantity} {shown_value(values[name], factor)}{f' {unit}' * bool(unit)}"
+                )
         found.append((words, group))
     return found
 
@@ -268,7 +295,11 @@ def shown_value(value: Any, factor: float = 1.0, missing: str = "as configured")
 
 def place_name(plant: Any, sensing: Any) -> str:  # noqa: ANN401 - cells of the table of runs
     """Return a plant's name for a title, with the sensing set-up where it is not the usual one."""
-    return f"{plant}" if sensing in (None, DEFAULT_SENSING) or pd.isna(sensing) else f"{plant} {sensing}"
+    return (
+        f"{plant}"
+        if sensing in (None, DEFAULT_SENSING) or pd.isna(sensing)
+        else f"{plant} {sensing}"
+    )
 
 
 def with_places(runs: pd.DataFrame) -> pd.DataFrame:
@@ -284,14 +315,20 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     A task of which no run could be built has no kind and is in neither.
     """
     kinds = texts_of(runs, "task_kind")
-    moves, curves = (runs[runs["task"].isin(runs.loc[kinds == kind, "task"].unique())] for kind in TASK_KINDS)
+    moves, curves = (
+        runs[runs["task"].isin(runs.loc[kinds == kind, "task"].unique())] for kind in TASK_KINDS
+    )
     return moves, curves
 
 
 def grouped(rows: Any) -> pd.DataFrame:  # noqa: ANN401 - rows, or columns by their names
     """Return a table whose columns are pairs (group, heading)."""
     table = pd.DataFrame(rows)
-    return table if table.empty else table.set_axis(pd.MultiIndex.from_tuples(map(tuple, table.columns)), axis=1)
+    return (
+        table
+        if table.empty
+        else table.set_axis(pd.MultiIndex.from_tuples(map(tuple, table.columns)), axis=1)
+    )
 
 
 def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
@@ -322,7 +359,9 @@ def achieved_share(runs: pd.DataFrame) -> Estimate:
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return the outcome of each run; in a table without it, `not_settled` or `not_followed` give no reason."""
     curve = texts_of(runs, "task_kind") == CURVE
-    follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(runs, "settling_band")
+    follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(
+        runs, "settling_band"
+    )
     on_curve = np.where(follows, FOLLOWED, NOT_FOLLOWED)
     moved = np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED)
     guessed = pd.Series(np.where(curve, on_curve, moved), index=runs.index)
@@ -359,7 +398,10 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
 def is_superfluous(name: str, runs: pd.DataFrame) -> bool:
     """Return whether a metric repeats another one: these runs have no second lap, or it is the judged part."""
     second = texts_of(runs, name)
-    return name == SECOND_LAP and (second.isna() | (second == column_of(runs, "rms_error_evaluated"))).all().item()
+    return (
+        name == SECOND_LAP
+        and (second.isna() | (second == column_of(runs, "rms_error_evaluated"))).all().item()
+    )
 
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
@@ -369,7 +411,11 @@ def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
         return runs
     handy = [handy_unit(unit if isinstance(unit, str) else None) for unit in units]
     factors = [factor for _, factor in handy]
-    changed = {name: factors * runs[name] for name, metric in METRICS.items() if not metric.unit and name in runs}
+    changed = {
+        name: factors * runs[name]
+        for name, metric in METRICS.items()
+        if not metric.unit and name in runs
+    }
     return runs.assign(feature_unit=[unit for unit, _ in handy], **changed)
 
 
@@ -394,9 +440,17 @@ def margin(name: str, runs: pd.DataFrame) -> float:
         return float(column_of(runs, "period_s").fillna(RunSettings.period).max())
     if unit:
         return SHARE_MARGIN if unit == "1" else 0.0
-    bounds = runs[runs["controller"].isin([each for each in runs["controller"].unique() if knows_truth(str(each))])]
+    bounds = runs[
+        runs["controller"].isin(
+            [each for each in runs["controller"].unique() if knows_truth(str(each))]
+        )
+    ]
     best = column_of(bounds, name).groupby(bounds["controller"]).median().min()
-    return float(np.nan_to_num(np.fmax(ERROR_MARGIN * column_of(runs, "settling_band").max(), BOUND_MARGIN * best)))
+    return float(
+        np.nan_to_num(
+            np.fmax(ERROR_MARGIN * column_of(runs, "settling_band").max(), BOUND_MARGIN * best)
+        )
+    )
 
 
 def knows_truth(name: str) -> bool:
@@ -407,7 +461,11 @@ def knows_truth(name: str) -> bool:
 
 
 def compare_pairs(
-    runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], *, metric: str = "settling_time_s", keys: Sequence[str] = KEYS
+    runs: pd.DataFrame,
+    pairs: Sequence[tuple[str, str]],
+    *,
+    metric: str = "settling_time_s",
+    keys: Sequence[str] = KEYS,
 ) -> list[Difference]:
     """Compare controllers on the runs of one place that they share.
 
@@ -432,7 +490,9 @@ def _paired_values(
     first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
     for name, series in zip(pair, (first, second), strict=True):
         if series.index.has_duplicates:
-            raise ConfigurationError(f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous")
+            raise ConfigurationError(
+                f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous"
+            )
     common = first.index.intersection(second.index, sort=False)
     if len(common) == 0:
         raise ValueError(f"{pair[0]} and {pair[1]} have no run in common: nothing to compare")

@@ -19,7 +19,14 @@ from servobench.plant.contract.files import accessing, write_atomically, write_c
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
 NANOSECONDS: Final = 1e9  # in a second
-TOPICS: Final = ("reference", "feature", "true_feature", "joint_position", "joint_velocity_command", "diagnostic")
+TOPICS: Final = (
+    "reference",
+    "feature",
+    "true_feature",
+    "joint_position",
+    "joint_velocity_command",
+    "diagnostic",
+)
 KEYS: Final = ("run_id", "step", "time_s")  # columns that say where a row belongs
 
 
@@ -94,9 +101,13 @@ def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> 
         for k, row in enumerate(steps.to_dict("records")):
             time = round(row["time_s"] * NANOSECONDS)
             for topic, columns in topics.items():
-                message = {"time_s": row["time_s"]} | {name: _plain(row[column]) for column, name in columns.items()}
+                message = {"time_s": row["time_s"]} | {
+                    name: _plain(row[column]) for column, name in columns.items()
+                }
                 data = json.dumps(message, allow_nan=False).encode()
-                writer.add_message(channels[topic], log_time=time, data=data, publish_time=time, sequence=k)
+                writer.add_message(
+                    channels[topic], log_time=time, data=data, publish_time=time, sequence=k
+                )
         writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -105,7 +116,11 @@ def _topics(steps: pd.DataFrame) -> dict[str, dict[str, str]]:
     grouped: dict[str, dict[str, str]] = {topic: {} for topic in (*TOPICS, "run")}
     for column in map(str, steps.columns):
         if column not in KEYS:
-            begun = (topic for topic in TOPICS if column.startswith(f"{topic}_") and column != "feature_valid")
+            begun = (
+                topic
+                for topic in TOPICS
+                if column.startswith(f"{topic}_") and column != "feature_valid"
+            )
             topic = next(begun, "run")
             grouped[topic][column] = column.removeprefix(f"{topic}_")
     return {topic: names for topic, names in grouped.items() if names}

@@ -17,7 +17,8 @@ from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import listed
 
-DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")  # columns, with settings that are varied
+# Columns, with settings that are varied
+DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")
 
 
 def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
@@ -29,7 +30,9 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
-    described = {name: (name, 1.0) for name in DESCRIBED if name in runs} | varied_columns(runs.columns)
+    described = {name: (name, 1.0) for name in DESCRIBED if name in runs} | varied_columns(
+        runs.columns
+    )
     for name, (heading, factor) in described.items():
         facts[heading] = listed([shown_value(value, factor) for value in runs[name].unique()])
     by = (manifest.get("packages") or {}).get("servobench") or "unknown"
@@ -71,7 +74,11 @@ def describe_settings(folder: Path) -> dict[str, str]:
         ConfigurationError: not a results folder.
     """
     sections = results.read_manifest(folder).get("configuration", {}).items()
-    return {f"{section}.{name}": _setting(value) for section, values in sections for name, value in values.items()}
+    return {
+        f"{section}.{name}": _setting(value)
+        for section, values in sections
+        for name, value in values.items()
+    }
 
 
 def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON
@@ -92,7 +99,13 @@ def _seeds(seeds: list[int]) -> str:
 SIGNS: Final = str.maketrans(
     {sign: f"\\{sign}" for sign in "_%&#${}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    | dict(zip("\u00a0∞–−×µ²³", ("~", r"$\infty$", "--", "$-$", r"$\times$", r"$\mu$", "$^2$", "$^3$"), strict=True))
+    | dict(
+        zip(
+            "\u00a0∞–−×µ²³",
+            ("~", r"$\infty$", "--", "$-$", r"$\times$", r"$\mu$", "$^2$", "$^3$"),
+            strict=True,
+        )
+    )
 )
 INTERVAL: Final = re.compile(r" (\[[^\[]*\])$")
 NUMBER: Final = re.compile(r"[-+\d∞–]")
@@ -122,7 +135,9 @@ def _table(title: str, rows: pd.DataFrame) -> str:
     letters = sum(rows[name].str.len().max() for name in rows)
     kind = "table" if letters <= ONE_COLUMN else "table*"
     sides = "".join("r" if rows[name].str.match(NUMBER).all() else "l" for name in rows)
-    cells = rows.map(lambda text: INTERVAL.sub(r" {\\scriptsize \1}", MINUS.sub("$-$", text.translate(SIGNS))))
+    cells = rows.map(
+        lambda text: INTERVAL.sub(r" {\\scriptsize \1}", MINUS.sub("$-$", text.translate(SIGNS)))
+    )
     lines = [
         rf"\begin{{{kind}}}\centering\footnotesize\setlength{{\tabcolsep}}{{4pt}}",
         rf"\caption{{{title.translate(SIGNS)}}}",
@@ -147,13 +162,19 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     Raises:
         ConfigurationError: not a results folder.
     """
-    manifest, facts, aids = results.read_manifest(folder), describe_folder(folder, runs), describe_controllers(folder)
+    manifest, facts, aids = (
+        results.read_manifest(folder),
+        describe_folder(folder, runs),
+        describe_controllers(folder),
+    )
     packages = manifest.get("packages") or {}
     version = str(packages.get("servobench") or "unknown").translate(SIGNS)
     commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
     used = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
     used += [str(engine) for engine in (manifest.get("engines") or {}).values()]
-    robots = ", ".join(str(each.get("title")) for each in manifest.get("robots", [])) or "unknown robot"
+    robots = (
+        ", ".join(str(each.get("title")) for each in manifest.get("robots", [])) or "unknown robot"
+    )
     seeds, count = facts["seeds"].partition(" (")[0], runs["seed"].nunique()
     sentences = [
         f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, "
@@ -170,7 +191,11 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     ]
     text = [sentences[0], *(each.translate(SIGNS) for each in sentences[1:])]
     year = str(manifest.get("created", ""))[:4].translate(SIGNS)
-    return rf"\paragraph{{Methods}} {'. '.join(text)}." + "\n\n" + BIBTEX % (year, f"{version}, commit {commit}")
+    return (
+        rf"\paragraph{{Methods}} {'. '.join(text)}."
+        + "\n\n"
+        + BIBTEX % (year, f"{version}, commit {commit}")
+    )
 
 
 def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> list[str]:
@@ -185,4 +210,8 @@ def _settings(changed: Mapping[str, Any] | None) -> str:
     if changed is None:
         return "All settings are in the file manifest.json of the results"
     pairs = ", ".join(f"{key} = {value}" for key, value in changed.items())
-    return f"Settings other than the defaults: {pairs}" if pairs else "All settings are the defaults of this version"
+    return (
+        f"Settings other than the defaults: {pairs}"
+        if pairs
+        else "All settings are the defaults of this version"
+    )

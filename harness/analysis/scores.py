@@ -45,7 +45,9 @@ def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray
     Raises:
         ValueError: a floor that is not above 0.
     """
-    own, reference, floor = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in (own, reference, floor)))
+    own, reference, floor = np.broadcast_arrays(
+        *(np.asarray(each, np.float64) for each in (own, reference, floor))
+    )
     if not (floor > 0.0).all():
         raise ValueError(f"floor must be above 0, got {float(np.min(floor))}")
     known = np.where(np.isfinite(own), np.maximum(own, floor), np.inf)
@@ -112,7 +114,9 @@ def resolution(table: pd.DataFrame) -> float:
     """
     by_robot = _by_robot(table, "score")
     values, generator = by_robot.to_numpy().T, np.random.default_rng(0)
-    challenges, seeds = (by_robot.index.get_level_values(name).to_numpy() for name in ("challenge", "seed"))
+    challenges, seeds = (
+        by_robot.index.get_level_values(name).to_numpy() for name in ("challenge", "seed")
+    )
     numbers, count = np.unique(seeds, return_inverse=True)[1], len(np.unique(seeds))
     rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
     if min(map(len, rows)) < 2:
@@ -121,7 +125,9 @@ def resolution(table: pd.DataFrame) -> float:
     for _ in range(SPLITS):
         order = generator.permutation(count)[numbers]
         shuffled = [own[np.argsort(order[own])] for own in rows]
-        halves = zip(*((own[: len(own) // 2], own[len(own) // 2 :]) for own in shuffled), strict=True)
+        halves = zip(
+            *((own[: len(own) // 2], own[len(own) // 2 :]) for own in shuffled), strict=True
+        )
         first, second = (_middle_means(values[:, np.concatenate(half)]) for half in halves)
         differences.append(np.abs(first - second))
     return float(np.median(differences))
@@ -139,14 +145,18 @@ def _by_robot(table: pd.DataFrame, column: str, *, lost: bool = False) -> pd.Dat
     filled = (known.fillna(np.inf) if lost else known).unstack("controller", sort=False)
     if len(missing := np.argwhere(filled.isna().to_numpy())):
         (challenge, seed), name = filled.index[missing[0, 0]], filled.columns[missing[0, 1]]
-        raise ValueError(f"{name} lacks the {column} of challenge {challenge}, seed {seed}: methods need the same runs")
+        raise ValueError(
+            f"{name} lacks the {column} of challenge {challenge}, seed {seed}: methods need the same runs"
+        )
     return filled.where(filled != np.inf) if lost else filled
 
 
 def _middle_means(values: FloatArray) -> FloatArray:
     """Return the interquartile mean over the last axis."""
     cut, count = int(TRIMMED * values.shape[-1]), values.shape[-1]
-    return np.asarray(np.partition(values, (cut, count - cut - 1))[..., cut : count - cut].mean(axis=-1))
+    return np.asarray(
+        np.partition(values, (cut, count - cut - 1))[..., cut : count - cut].mean(axis=-1)
+    )
 
 
 def _means_with_resamples(by_robot: pd.DataFrame) -> tuple[pd.Series[float], pd.DataFrame]:
@@ -154,9 +164,13 @@ def _means_with_resamples(by_robot: pd.DataFrame) -> tuple[pd.Series[float], pd.
     values, generator = np.ascontiguousarray(by_robot.to_numpy().T), np.random.default_rng(0)
     challenges = by_robot.index.get_level_values("challenge").to_numpy()
     rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
-    samples = (np.concatenate([generator.choice(own, len(own)) for own in rows]) for _ in range(RESAMPLES))
+    samples = (
+        np.concatenate([generator.choice(own, len(own)) for own in rows]) for _ in range(RESAMPLES)
+    )
     drawn = [_middle_means(values[:, sample]) for sample in samples]
-    means = pd.Series(_middle_means(values), index=by_robot.columns).sort_values(ascending=False, kind="stable")
+    means = pd.Series(_middle_means(values), index=by_robot.columns).sort_values(
+        ascending=False, kind="stable"
+    )
     return means, pd.DataFrame(drawn, columns=by_robot.columns)
 
 
@@ -166,8 +180,17 @@ def _told_apart(means: pd.Series[float], drawn: pd.DataFrame) -> set[frozenset[s
     pairs = list(combinations(map(str, means.index), 2))
     p_values = []
     for first, second in pairs:
-        deviation, difference = float((drawn[first] - drawn[second]).std()), abs(means[first] - means[second])
+        deviation, difference = (
+            float((drawn[first] - drawn[second]).std()),
+            abs(means[first] - means[second]),
+        )
         certain = 0.0 if difference > 0.0 else 1.0
         with np.errstate(under="ignore"):
-            p_values.append(2.0 * float(stats.norm.sf(difference / deviation)) if deviation > 0.0 else certain)
-    return {frozenset(pair) for pair, p_value in zip(pairs, holm(p_values), strict=True) if p_value < ALPHA}
+            p_values.append(
+                2.0 * float(stats.norm.sf(difference / deviation)) if deviation > 0.0 else certain
+            )
+    return {
+        frozenset(pair)
+        for pair, p_value in zip(pairs, holm(p_values), strict=True)
+        if p_value < ALPHA
+    }

@@ -68,10 +68,21 @@ from servobench.plant.contract.settings import suggest
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 Row: TypeAlias = "dict[str, Cell]"
 BAND: Final = ("settling_band", "feature_unit")
+# Columns that `sweep_tables` and `outcome_legend` read
 SWEEP_COLUMNS: Final = (
-    "plant", "mismatch", *(short.column for short in SHORT_NAMES.values()), "sensing", "task", "controller", "status",
-    "outcome", "settling_time_s", "task_kind", "rms_error_evaluated", *BAND,
-)  # columns that `sweep_tables` and `outcome_legend` read # fmt: skip
+    "plant",
+    "mismatch",
+    *(short.column for short in SHORT_NAMES.values()),
+    "sensing",
+    "task",
+    "controller",
+    "status",
+    "outcome",
+    "settling_time_s",
+    "task_kind",
+    "rms_error_evaluated",
+    *BAND,
+)
 PAIR: Final = "A − B"  # heading of the first column of paired differences
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
@@ -119,7 +130,9 @@ def statistics_tables(runs: pd.DataFrame, metric: str | None = None) -> Tables:
             yield f"paired differences, verdicts with a margin of {table.pop('margin')[0]}", table
 
 
-def statistics_rows(runs: pd.DataFrame, metric: str | None = None) -> Iterator[tuple[str, list[Row], list[Row]]]:
+def statistics_rows(
+    runs: pd.DataFrame, metric: str | None = None
+) -> Iterator[tuple[str, list[Row], list[Row]]]:
     """Yield for each plant, task and condition its words, a row for each controller and one for each pair of them."""
     for words, place in split_conditions(runs):
         yield words, _controller_rows(place), _pair_rows(place, metric)
@@ -141,28 +154,37 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
             row[heading["overshoot"]] = Cell(_median(100.0 * column_of(own, "overshoot")), ".1f")
         row[heading[judged]] = Cell(_median(error), ".1f")
         row[f"its worst 5 % {heading[judged].rpartition(' ')[2]}"] = Cell(tail_mean(error), ".1f")
-        row["failures"] = Cell(", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none")
+        row["failures"] = Cell(
+            ", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none"
+        )
         rows.append(row)
     return rows
 
 
 def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller", sort=False)}
-    pairs = [pair for pair in combinations(seeds, 2) if seeds[pair[0]] & seeds[pair[1]]]  # a batch may be unfinished
+    # A batch may be unfinished
+    pairs = [pair for pair in combinations(seeds, 2) if seeds[pair[0]] & seeds[pair[1]]]
     if not pairs and metric is None:
         return []
     if not pairs:
-        raise ConfigurationError(f"no two controllers have runs of one seed to compare; leave --metric {metric} out")
+        raise ConfigurationError(
+            f"no two controllers have runs of one seed to compare; leave --metric {metric} out"
+        )
     judged = judged_metric(runs)
     metric = judged if metric is None else metric
     filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
     numbers = {judged, *map(str, filled)} & set(runs) - {"seed"}
     if metric not in numbers:
-        raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
+        raise ConfigurationError(
+            f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}"
+        )
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
     unit, factor = shown_unit(metric, runs) if metric in METRICS else ("1", 1.0)
     heading = metric_heading(metric, runs) if metric in METRICS else metric.replace("_", " ")
-    words = {} if metric in METRICS and METRICS[metric].better else {"better": "less", "worse": "more"}
+    words = (
+        {} if metric in METRICS and METRICS[metric].better else {"better": "less", "worse": "more"}
+    )
     return [
         {
             PAIR: Cell(f"{first} − {second}"),
@@ -183,7 +205,9 @@ def _median(values: pd.Series[float]) -> Estimate:
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
     """Return the meaning of the good outcomes that these runs can have, a line each; the table of runs has parts."""
-    known = pd.concat([part.reindex(columns=[*BAND, "task_kind"]).drop_duplicates() for part in parts])
+    known = pd.concat(
+        [part.reindex(columns=[*BAND, "task_kind"]).drop_duplicates() for part in parts]
+    )
     lines = {
         POINT_TO_POINT: f"{SETTLED}: came within {settling_band(known)} and stayed",
         CURVE: f"{FOLLOWED}: {METRICS['rms_error_evaluated'].label} at most {settling_band(known, FOLLOWING_BANDS)}",
@@ -214,13 +238,17 @@ def _judged_parts(curves: Iterable[str]) -> str:
 
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
-    for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
+    for (plant, mismatch, task), place in with_places(runs).groupby(
+        ["plant", "mismatch", "task"], sort=False
+    ):
         kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
         summaries = [
             (column, metric.summary)
             for wanted in (kind, None)  # measures of such tasks first
             for column, metric in METRICS.items()
-            if metric.summary and metric.summary.kind == wanted and not is_superfluous(column, place)
+            if metric.summary
+            and metric.summary.kind == wanted
+            and not is_superfluous(column, place)
         ]
         rows = []
         for name, own in place.groupby("controller", sort=False):
@@ -242,7 +270,11 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
 def _shares(runs: pd.DataFrame) -> str:
     """Return the outcome that all runs have, or a line for each outcome with its share."""
     shares = 100.0 * outcomes(runs).value_counts(normalize=True)
-    return shares.index[0] if len(shares) == 1 else "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
+    return (
+        shares.index[0]
+        if len(shares) == 1
+        else "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
+    )
 
 
 def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
@@ -257,7 +289,9 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
         counted.append(_count_outcomes(part))
         curves |= set(split_tasks(part)[1]["task"])
     keys = list(counted[0].columns[:-2])
-    counts = pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
+    counts = (
+        pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
+    )
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
         sums = place.assign(good=good).groupby(keys[2:], sort=False)[["good", "runs"]].sum()
@@ -269,9 +303,14 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
             del shares[SHORT_NAMES["period"].heading]
         yield f"{task} on {plant}: {word} [%]", shares
         if good.sum() < place["runs"].sum():
-            kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
+            kinds = place.pivot_table(
+                values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False
+            )
             table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(number, spec=".1f")
-            yield f"{task} on {plant}: outcomes of the runs [%]", table.rename_axis(columns=None).reset_index()
+            yield (
+                f"{task} on {plant}: outcomes of the runs [%]",
+                table.rename_axis(columns=None).reset_index(),
+            )
 
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
@@ -293,12 +332,13 @@ def _is_late(runs: pd.DataFrame) -> bool:
 
 WHICH: Final = ""  # the group of columns that say which runs a row is about
 CONDITIONS: Final = ("plant", "robot", "sensing", "mismatch")  # with the settings that are varied
+# Table -> groups of columns in order; a metric says in which of them it is
 GROUPS: Final = {
     "moves": ("Time", "Error", "Motion"),
     "curves": ("RMS error", "Motion"),
     "cost": ("Step of the controller", "Joints", "Estimate"),
     "runs": ("Time", "Error", "Motion"),
-}  # table -> groups of columns in order; a metric says in which of them it is
+}
 MEANINGS: Final = {
     NOT_SETTLED: "the true error did not come into the settling band, or left it again",
     NOT_FOLLOWED: "the RMS error of the judged part of the curve is too large",
@@ -320,7 +360,10 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
     if len(places) > MOST_PLACES:
         pooled = runs.groupby(["task", "feature_unit"], sort=False, dropna=False)
         units = runs["feature_unit"].nunique(dropna=False) > 1
-        places = [(f"{task}, features in {unit}" if units else str(task), own) for (task, unit), own in pooled]
+        places = [
+            (f"{task}, features in {unit}" if units else str(task), own)
+            for (task, unit), own in pooled
+        ]
         interval = False
     single = runs["plant"].nunique() * runs["mismatch"].nunique() == 1
     rows = []
@@ -328,12 +371,20 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
         row: PageRow = {(WHICH, "controller"): name}
         for words, place in places:
             own = place[place["controller"] == name]
-            where = str(place["task"].iloc[0]) if single and place["task"].nunique() == 1 and len(places) > 1 else words
-            row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
+            where = (
+                str(place["task"].iloc[0])
+                if single and place["task"].nunique() == 1 and len(places) > 1
+                else words
+            )
+            row[where, f"{achievement(place)} [%]"] = (
+                f"{achieved_share(own):.0f}" if len(own) else MISSING
+            )
             metric = judged_metric(place)
             values = judged_column(place)[place["controller"] == name]
             middle = median_with_interval(values) if len(values) else NO_ESTIMATE
-            middle = middle if interval else Estimate(middle.value, math.nan, math.nan, middle.count)
+            middle = (
+                middle if interval else Estimate(middle.value, math.nan, math.nan, middle.count)
+            )
             row[where, metric_heading(metric, place)] = f"{middle:.{METRICS[metric].digits}f}"
         rows.append(row)
     return grouped(rows)
@@ -380,10 +431,17 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each way in which runs of a controller ended early, with the reason of the first."""
     failed = runs[runs["status"] != COMPLETED]
     rows = []
-    for (controller, plant, status), own in failed.groupby(["controller", "plant", "status"], sort=False):
+    for (controller, plant, status), own in failed.groupby(
+        ["controller", "plant", "status"], sort=False
+    ):
         total = ((runs["controller"] == controller) & (runs["plant"] == plant)).sum()
         first = own.iloc[0]
-        which = {"controller": controller, "plant": plant, "ended by": status, "runs": f"{len(own)} of {total}"}
+        which = {
+            "controller": controller,
+            "plant": plant,
+            "ended by": status,
+            "runs": f"{len(own)} of {total}",
+        }
         example = {"run": first["run_id"], "reason": first.get("reason") or MISSING}
         rows.append({(WHICH, name): str(text) for name, text in which.items()}
                     | {("The first of them", name): str(text) for name, text in example.items()})  # fmt: skip
@@ -405,7 +463,9 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     for group, name in _columns("runs", runs):
         _, factor = shown_unit(name, runs)
         spec = f".{METRICS[name].digits}f"
-        table[group, metric_heading(name, runs)] = [number(factor * value, spec) for value in column_of(runs, name)]
+        table[group, metric_heading(name, runs)] = [
+            number(factor * value, spec) for value in column_of(runs, name)
+        ]
     return grouped(table)
 
 
@@ -417,7 +477,10 @@ def ordered(names: pd.Series[str]) -> list[str]:
 
 
 def _by_task(runs: pd.DataFrame, kind: str) -> dict[str, pd.DataFrame]:
-    return {str(task): _table(own, kind, _varied(runs), counted=True) for task, own in runs.groupby("task", sort=False)}
+    return {
+        str(task): _table(own, kind, _varied(runs), counted=True)
+        for task, own in runs.groupby("task", sort=False)
+    }
 
 
 def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool) -> pd.DataFrame:
@@ -431,7 +494,9 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
         else:
             row["Runs", "lost [%]"] = f"{100.0 - achieved_share(own).value:.0f}"
         for group, heading, name in columns:
-            row[group, heading] = f"{_median_of(own, name, shown_unit(name, runs)[1]):.{METRICS[name].digits}f}"
+            row[group, heading] = (
+                f"{_median_of(own, name, shown_unit(name, runs)[1]):.{METRICS[name].digits}f}"
+            )
         rows.append(row)
     return grouped(rows)
 
@@ -462,7 +527,9 @@ def _columns(kind: str, runs: pd.DataFrame) -> list[tuple[str, str]]:
         (group, name)
         for group in GROUPS[kind]
         for name, metric in METRICS.items()
-        if metric.tables.get(kind) == group and column_of(runs, name).notna().any() and not is_superfluous(name, runs)
+        if metric.tables.get(kind) == group
+        and column_of(runs, name).notna().any()
+        and not is_superfluous(name, runs)
     ]
 
 

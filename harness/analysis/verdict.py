@@ -77,8 +77,13 @@ def ranked_controllers(runs: pd.DataFrame) -> list[str]:
 
 def asked_of(runs: pd.DataFrame) -> str:
     """Return the goal of these runs as a verb in the past tense."""
-    words: dict[tuple[bool, ...], str] = {(True, False): "settled", (False, True): "followed the curve"}
-    return words.get(tuple(len(part) > 0 for part in split_tasks(runs)), "settled or followed the curve")
+    words: dict[tuple[bool, ...], str] = {
+        (True, False): "settled",
+        (False, True): "followed the curve",
+    }
+    return words.get(
+        tuple(len(part) > 0 for part in split_tasks(runs)), "settled or followed the curve"
+    )
 
 
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
@@ -107,7 +112,9 @@ def judged_values(place: pd.DataFrame) -> pd.DataFrame:
 def judged_column(runs: pd.DataFrame) -> pd.Series[float]:
     """Return the judged metric of each run in the unit in which it is shown; infinite where the run is lost."""
     metric = judged_metric(runs)
-    values = shown_unit(metric, runs)[1] * column_of(runs, metric).where(runs["status"] == COMPLETED)
+    values = shown_unit(metric, runs)[1] * column_of(runs, metric).where(
+        runs["status"] == COMPLETED
+    )
     return values.fillna(np.inf)
 
 
@@ -141,7 +148,9 @@ def _of_several(runs: pd.DataFrame) -> str:
     """Return how often ranked controllers succeeded."""
     shares = _shares(runs)
     asked, most, least = asked_of(runs), max(shares.values()), min(shares.values())
-    best, worst = ([name for name, share in shares.items() if share == each] for each in (most, least))
+    best, worst = (
+        [name for name, share in shares.items() if share == each] for each in (most, least)
+    )
     if most == 0.0:
         return f"None of the {len(shares)} controllers {asked} in any of {len(runs)} runs."
     if most == least:
@@ -180,7 +189,15 @@ def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
         return ""
     groups: dict[tuple[object, ...], list[_Standing]] = {}
     for each in known:
-        told = each.equal, each.undecided, each.ahead, each.behind, math.isnan(each.by), each.metric, each.unit
+        told = (
+            each.equal,
+            each.undecided,
+            each.ahead,
+            each.behind,
+            math.isnan(each.by),
+            each.metric,
+            each.unit,
+        )
         groups.setdefault(told, []).append(each)
     return "; ".join(_clause(own, len(known)) for own in groups.values()) + "."
 
@@ -197,7 +214,9 @@ def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
     by = -against[behind].mean.value if behind and against[behind].mean.high < -small else math.nan
     best = (order[0], *having["equivalent"])
     equal = tuple(name for name in dict.fromkeys(own["controller"]) if name in best)
-    return _Standing(words, equal, having["undecided"], having["worse"], behind, by, metric, unit, small)
+    return _Standing(
+        words, equal, having["undecided"], having["worse"], behind, by, metric, unit, small
+    )
 
 
 def _clause(places: Sequence[_Standing], count: int) -> str:
@@ -210,7 +229,9 @@ def _clause(places: Sequence[_Standing], count: int) -> str:
     low, high = (f"{end(each.by for each in places):.2f}" for end in (min, max))
     fewer_lost = one.behind and "nan" in (low, high)
     if one.behind and not fewer_lost:
-        parts.append(f"{low if low == high else f'{low} to {high}'} {one.unit} ahead of `{one.behind}`")
+        parts.append(
+            f"{low if low == high else f'{low} to {high}'} {one.unit} ahead of `{one.behind}`"
+        )
     words = f"{_listed(one.equal, MANY)} {'are' if many else 'is'} {'first' if one.undecided else 'best'}{where}"
     words += f": {' and '.join(parts)} in {label}" if parts else ""
     words += f", losing fewer runs than `{one.behind}`" if fewer_lost else ""
@@ -234,14 +255,20 @@ def _doubts(runs: pd.DataFrame) -> str:
     table = achieved.pivot_table(index="seed", columns="controller", values="score", sort=False)
     best = max((shares := _shares(runs)), key=lambda name: shares[name])
     ahead = {name: table[best] - table[name] for name in shares}
-    apart = [name for name, each in ahead.items() if is_majority(int((each > 0.0).sum()), int((each < 0.0).sum()))]
+    apart = [
+        name
+        for name, each in ahead.items()
+        if is_majority(int((each > 0.0).sum()), int((each < 0.0).sum()))
+    ]
     if not apart:
         return "The success rates do not differ significantly."
     less = f"{_listed(apart, MANY)} succeed{'s' if len(apart) == 1 else ''} significantly less often than `{best}`"
     return f"{less} (sign test over seeds)."
 
 
-def _competitions(runs: pd.DataFrame, names: Sequence[str]) -> list[tuple[str, pd.DataFrame, pd.DataFrame]]:
+def _competitions(
+    runs: pd.DataFrame, names: Sequence[str]
+) -> list[tuple[str, pd.DataFrame, pd.DataFrame]]:
     """Return each place with more than one of some controllers: words, its runs, and those of these controllers."""
     places = split_conditions(runs)
     alone = len(places) == runs["task"].nunique()
@@ -259,7 +286,10 @@ def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str
     order = sorted(shares, key=lambda name: (-shares[name], table[name].median()))
     small = shown_unit(judged_metric(place), place)[1] * margin(judged_metric(place), place)
     pairs = {name: table[[order[0], name]].dropna() for name in order[1:]}
-    return order, {name: paired_difference(each.iloc[:, 0], each.iloc[:, 1], small) for name, each in pairs.items()}
+    return order, {
+        name: paired_difference(each.iloc[:, 0], each.iloc[:, 1], small)
+        for name, each in pairs.items()
+    }
 
 
 def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
@@ -269,7 +299,9 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
     rivals = [name for name, each in against.items() if each.verdict != "better"]
 
     def median(name: str) -> str:
-        value, *interval = f"{median_with_interval(table[name].dropna()):.{METRICS[metric].digits}f}".split(" ", 1)
+        value, *interval = (
+            f"{median_with_interval(table[name].dropna()):.{METRICS[metric].digits}f}".split(" ", 1)
+        )
         lost = f"({100.0 * (1.0 - shares[name]):.0f} % lost)" if shares[name] < 1.0 else ""
         return " ".join([value, unit, *interval, lost]).rstrip()
 
@@ -280,13 +312,18 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
         ("First", "median"): median(first),
         ("Next", "controller"): second,
         ("Next", "median"): median(second),
-        ("How sure", "not shown to be behind the first"): _listed(rivals).replace("`", "") if rivals else "none",
+        ("How sure", "not shown to be behind the first"): _listed(rivals).replace("`", "")
+        if rivals
+        else "none",
     }
 
 
 def _shares(runs: pd.DataFrame) -> dict[str, float]:
     good = outcomes(runs).isin(ACHIEVED)
-    return {str(name): float(share) for name, share in good.groupby(runs["controller"], sort=False).mean().items()}
+    return {
+        str(name): float(share)
+        for name, share in good.groupby(runs["controller"], sort=False).mean().items()
+    }
 
 
 def _share(runs: pd.DataFrame) -> str:

@@ -16,10 +16,23 @@ import pandas as pd
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
-from servobench.harness.batch.plan import MAX_SEEDS, Batch, Cell, Grid, check_seeds, refuse_tuning_seeds
+from servobench.harness.batch.plan import (
+    MAX_SEEDS,
+    Batch,
+    Cell,
+    Grid,
+    check_seeds,
+    refuse_tuning_seeds,
+)
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import GUARD, START_ERROR
-from servobench.harness.config.registry import can_travel, choose_controller, choose_plant, offered, offering
+from servobench.harness.config.registry import (
+    can_travel,
+    choose_controller,
+    choose_plant,
+    offered,
+    offering,
+)
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, read_mismatch, read_seed
@@ -83,7 +96,13 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        place = choose_plant(plant), choose_controller(controller), _task_name(task), read_mismatch(mismatch), seed
+        place = (
+            choose_plant(plant),
+            choose_controller(controller),
+            _task_name(task),
+            read_mismatch(mismatch),
+            seed,
+        )
         request = RunRequest(*place, robot=robot, sensing=sensing)
         refuse_tuning_seeds(check_seeds((request.seed,), f"got {seed}"))
         given = Settings(settings or {})
@@ -139,13 +158,33 @@ def compare(
         ConfigurationError: something that cannot be used; it is a ValueError.
     """
     chosen = _seeds(seeds)
-    _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings)
-    for name, value in {"workers": workers, "run_timeout": run_timeout, "run_memory": run_memory}.items():
+    _check_lists(
+        controllers=controllers,
+        plants=plants,
+        tasks=tasks,
+        mismatches=mismatches,
+        sensings=sensings,
+    )
+    for name, value in {
+        "workers": workers,
+        "run_timeout": run_timeout,
+        "run_memory": run_memory,
+    }.items():
         fits = value is None or (isinstance(value, int | float | np.number) and value > 0)
         _require(fits, name, "a number above 0", value)
-        _require(value is None or value < 1e300 or value == np.inf, name, "below 1e300, or inf for no limit", value)
+        _require(
+            value is None or value < 1e300 or value == np.inf,
+            name,
+            "below 1e300, or inf for no limit",
+            value,
+        )
     _require(workers is None or workers % 1 == 0, "workers", "a whole number", workers)
-    _require(isinstance(executor, Executor | None), "executor", "an executor of concurrent.futures", executor)
+    _require(
+        isinstance(executor, Executor | None),
+        "executor",
+        "an executor of concurrent.futures",
+        executor,
+    )
     for name, switch in {"isolate": isolate, "resume": resume}.items():
         _require(isinstance(switch, int | np.bool_ | None), name, "True or False", switch)
     _require(isinstance(out, str | os.PathLike | None), "out", "the path of a folder", out)
@@ -153,16 +192,29 @@ def compare(
         remark("isolate has no effect with an executor: nothing limits the runs in its processes")
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
-    if current_process().name == GUARD and (isolate or run_timeout or run_memory or workers != 1 or out is not None):
-        raise SystemExit(START_ERROR)  # it imports a script without a guard; the process above says the remedy
+    if current_process().name == GUARD and (
+        isolate or run_timeout or run_memory or workers != 1 or out is not None
+    ):
+        # It imports a script without a guard; the process above says the remedy
+        raise SystemExit(START_ERROR)
     with offering():
         names = tuple(choose_controller(each) for each in controllers)
         worlds = tuple(choose_plant(each) for each in plants)
-        batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
+        batch = Batch(
+            worlds,
+            names,
+            tuple(map(_task_name, tasks)),
+            tuple(mismatches),
+            chosen,
+            robot,
+            tuple(sensings),
+        )
         how = Execution(workers, executor, Bounds(run_timeout, run_memory, isolate), resume)
         if not can_travel(offered([*worlds, *names, *batch.tasks])):
             if how.workers != 1 or how.scheduler or how.bounds != Bounds(isolate=False):
-                remark("code of this batch cannot be sent to other processes; its runs stay here, without limits")
+                remark(
+                    "code of this batch cannot be sent to other processes; its runs stay here, without limits"
+                )
             how = Execution(1, None, Bounds(isolate=False), resume)
         given = Settings(settings or {})
         if out is not None:
@@ -175,11 +227,17 @@ def compare(
 
 def _seeds(given: object) -> Sequence[int]:
     """Return the seeds of an argument that counts or lists them."""
-    if isinstance(given, SupportsIndex) and not getattr(given, "ndim", 0):  # an array has an index, too
+    if isinstance(given, SupportsIndex) and not getattr(
+        given, "ndim", 0
+    ):  # an array has an index, too
         return check_seeds(range(operator.index(given)), f"got {given!r}")
     if isinstance(given, str | bytes) or not isinstance(given, Iterable):
-        raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {native(given)!r}")
-    return check_seeds(tuple(map(read_seed, islice(given, MAX_SEEDS + 1))), "see the list that was given")
+        raise ConfigurationError(
+            f"seeds must be a number of seeds or a list of them, got {native(given)!r}"
+        )
+    return check_seeds(
+        tuple(map(read_seed, islice(given, MAX_SEEDS + 1))), "see the list that was given"
+    )
 
 
 def _require(fits: bool, name: str, wanted: str, came: object) -> None:

@@ -37,7 +37,16 @@ import numpy.typing as npt
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors, can_watch
-from servobench.harness.batch.sandbox import SILENT, TALKATIVE, Answer, End, Pool, Task, Tell, Workers
+from servobench.harness.batch.sandbox import (
+    SILENT,
+    TALKATIVE,
+    Answer,
+    End,
+    Pool,
+    Task,
+    Tell,
+    Workers,
+)
 from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile, check_present_folder
 from servobench.harness.run import episode
@@ -48,10 +57,14 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.settings import REMARKS, remark
 from servobench.plant.fmu.release import delayed_releases
 
-BLOCK: Final = 256  # [runs] that advance together: networks of more of them leave the cache of a processor
+BLOCK: Final = (
+    256  # [runs] that advance together: networks of more of them leave the cache of a processor
+)
 RUN_ID: Final = "run_id"
 TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
-CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
+CHUNK: Final = (
+    8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
+)
 
 
 @dataclass(frozen=True)
@@ -61,14 +74,20 @@ class Job:
     index: int  # of the cell in its plan
     cell: Cell
     run: ResolvedRun
-    kind: Hashable | None = None  # runs of one kind may advance together; None: the run goes by itself
+    kind: Hashable | None = (
+        None  # runs of one kind may advance together; None: the run goes by itself
+    )
 
     @property
     def owner(self) -> str:
         """Whose code the run carries out: the names of its plant and controller; empty for that of this package."""
         plant, controller = self.cell.request.plant, self.cell.request.controller
-        foreign = registry.is_foreign_plant(plant, trusted=not getattr(self.run.plant, "isolate", True))
-        return f"{plant} {controller}" if foreign or registry.is_foreign_controller(controller) else ""
+        foreign = registry.is_foreign_plant(
+            plant, trusted=not getattr(self.run.plant, "isolate", True)
+        )
+        return (
+            f"{plant} {controller}" if foreign or registry.is_foreign_controller(controller) else ""
+        )
 
 
 @dataclass(frozen=True)
@@ -91,7 +110,9 @@ def even_size(count: int, workers: int, most: int = BLOCK) -> int:
     return math.ceil(count / (workers * max(rounds, 1)))
 
 
-def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[registry.Offer, ...] = ()) -> Iterator[Block]:
+def cut(
+    jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[registry.Offer, ...] = ()
+) -> Iterator[Block]:
     """Yield jobs in blocks of one kind, one owner and consecutive indices.
 
     Args:
@@ -100,13 +121,20 @@ def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[registry.
         chunk: at most so many runs that go one by one are in a block.
         own: controllers and plants that users gave.
     """
-    for (_, kind, _), alike in groupby(enumerate(jobs), lambda at: (at[1].index - at[0], at[1].kind, at[1].owner)):
+    for (_, kind, _), alike in groupby(
+        enumerate(jobs), lambda at: (at[1].index - at[0], at[1].kind, at[1].owner)
+    ):
         while gathered := tuple(job for _, job in islice(alike, chunk if kind is None else size)):
             yield Block(gathered, own, kind is not None)
 
 
 def carry_out_blocks(
-    blocks: Iterable[Block], workers: Workers, *, steps: bool = False, keep: Path | None = None, debug: bool = False
+    blocks: Iterable[Block],
+    workers: Workers,
+    *,
+    steps: bool = False,
+    keep: Path | None = None,
+    debug: bool = False,
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out blocks and yield each, whole or run by run, with its results as it finishes, in any order.
 
@@ -145,7 +173,9 @@ def carry_out_blocks(
             yield block.part(0, len(done)), done
 
 
-def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> tuple[list[RunResult], list[Block]]:
+def _outcome(
+    block: Block, future: Future[Answer | bytes], workers: Workers
+) -> tuple[list[RunResult], list[Block]]:
     """Return the results of the first runs of a block, and in blocks the runs that are still to be carried out."""
     try:
         answer = _received(future)
@@ -156,7 +186,9 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
             return [_failed(job, Ending(status, reason, trace)) for job in block.jobs], []
     done, end = list[RunResult](), answer.end
     try:
-        done.extend(unpack_result(job, item) for job, item in zip(block.jobs, answer.items, strict=False))
+        done.extend(
+            unpack_result(job, item) for job, item in zip(block.jobs, answer.items, strict=False)
+        )
     except (ValueError, RecursionError) as error:
         reason = f"the answer of the run cannot be read: {error}"
         end = End(Ending(CRASHED, reason), certain=False)
@@ -183,7 +215,12 @@ def _received(future: Future[Answer | bytes]) -> Answer:
     return told if isinstance(told, Answer) else Answer(json.loads(zlib.decompress(told)))
 
 
-def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = False, keep: Path | None = None) -> Task:
+def _task(
+    function: Callable[[Any, Tell], None],
+    block: Block,
+    steps: bool = False,
+    keep: Path | None = None,
+) -> Task:
     """Return the task of a block; files of users are loaded first, so that the classes of their settings are found."""
     sources = tuple(each.source for each in block.own if each.source is not None)
     try:
@@ -221,7 +258,9 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
             case str(refusal):
                 refused.append(refusal)
 
-    for item in _received(submit(_task(_build, block), hear)).items:  # of workers elsewhere, whose answers come at once
+    for item in _received(
+        submit(_task(_build, block), hear)
+    ).items:  # of workers elsewhere, whose answers come at once
         hear(item)
     if refused:
         raise ConfigurationError(refused[0])
@@ -281,7 +320,9 @@ def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool,
     return unpacked
 
 
-def _carry_out(block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool) -> None:
+def _carry_out(
+    block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool
+) -> None:
     """Carry a block out and tell the result of each run."""
     with registry.offering(block.own):
         together = []
@@ -293,11 +334,14 @@ def _carry_out(block: Block, tell: Callable[[RunResult], None], steps: bool, kee
             tell(_with_columns(job.cell, result))
         for job in block.jobs[len(together) :]:
             try:
-                result = episode.carry_out(job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug)
+                result = episode.carry_out(
+                    job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug
+                )
             except BaseException as error:
                 if debug or ends_batch(error):
                     raise
-                tell(_failed(job, Ending.of(error)))  # a plug-in may raise anything; the other runs go on
+                # A plug-in may raise anything; the other runs go on
+                tell(_failed(job, Ending.of(error)))
             else:
                 tell(_with_columns(job.cell, result))
 
@@ -312,7 +356,11 @@ def _failed(job: Job, ending: Ending) -> RunResult:
 
 def pack_result(result: RunResult) -> dict[str, Any]:
     """Return a result as JSON values, which a process can read without executing code of the sender."""
-    steps = None if result.steps is None else result.steps.drop(columns=RUN_ID, errors="ignore").to_records(index=False)
+    steps = (
+        None
+        if result.steps is None
+        else result.steps.drop(columns=RUN_ID, errors="ignore").to_records(index=False)
+    )
     return {"row": result.row, "steps": _pack_array(steps), "picture": _pack_array(result.picture),
             "trace": result.trace}  # fmt: skip
 
@@ -336,9 +384,13 @@ def unpack_result(job: Job, told: object) -> RunResult:
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
     own = (identity.keys() | job.cell.columns.keys()) - {"robot", "engine"}
-    if len({json.dumps([each[name] for name in own]) for each in (known, row)}) > 1:  # NaN is NaN, but 1 not 1.0
+    if (
+        len({json.dumps([each[name] for name in own]) for each in (known, row)}) > 1
+    ):  # NaN is NaN, but 1 not 1.0
         raise ValueError("it is that of another run")
-    for name, wanted in tables.unfit_kinds(tuple((name, type(row[name]), type(known.get(name))) for name in row)):
+    for name, wanted in tables.unfit_kinds(
+        tuple((name, type(row[name]), type(known.get(name))) for name in row)
+    ):
         raise ValueError(f"its {name} is {str(row[name])[:60]!r}, wanted a value of type {wanted}")
     for name, most in tables.MOST.items():
         if (value := row.get(name)) is not None and (value < 0 or value > most):
@@ -346,7 +398,9 @@ def unpack_result(job: Job, told: object) -> RunResult:
     if wrong := tables.unfit_names(tuple(row)):
         raise ValueError(f"it {wrong}")
     image = _unpack_array(picture)
-    if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
+    if image is not None and (
+        image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size
+    ):
         raise ValueError("its picture is no image")
     records = _unpack_array(steps)
     table = None if records is None else tables.steps_of_run(records, row[RUN_ID])
@@ -369,15 +423,21 @@ def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
     """Return the array of a text; a ValueError if it is that of none."""
     if text is None:
         return None
-    with configuration_errors("", EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError):
-        array: npt.NDArray[Any] = np.lib.format.read_array(BytesIO(b64decode(text)), allow_pickle=False)
+    with configuration_errors(
+        "", EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError
+    ):
+        array: npt.NDArray[Any] = np.lib.format.read_array(
+            BytesIO(b64decode(text)), allow_pickle=False
+        )
     return array
 
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
-MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks", "numpy.ma")  # imported once
-ONE_TASK: Final = threading.Lock()  # held by the one task that a process of an executor carries out at a time
+# Imported once
+MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks", "numpy.ma")
+# Held by the one task that a process of an executor carries out at a time
+ONE_TASK: Final = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -412,17 +472,29 @@ def open_workers(
             for elsewhere, or an executor has threads.
     """
     if isinstance(scheduler, str) and count is not None:
-        raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
+        raise ConfigurationError(
+            "--workers are processes of this machine; with --scheduler the cluster has its own"
+        )
     count = count or min(MAX_DEFAULT_WORKERS, available_processors())
     if scheduler is not None:
         if bounds.run_timeout is not None or bounds.run_memory is not None:
-            raise ConfigurationError("limits of time and memory are for processes of this machine, not for a cluster")
-        place = _open_cluster(scheduler) if isinstance(scheduler, str) else contextlib.nullcontext(scheduler)
+            raise ConfigurationError(
+                "limits of time and memory are for processes of this machine, not for a cluster"
+            )
+        place = (
+            _open_cluster(scheduler)
+            if isinstance(scheduler, str)
+            else contextlib.nullcontext(scheduler)
+        )
         try:
             with place as executor:
                 yield _workers_of(executor, count)
         except (BrokenExecutor, CancelledError) as error:
-            again = " with --resume (if it has it)" if isinstance(scheduler, str) else " with out and resume=True"
+            again = (
+                " with --resume (if it has it)"
+                if isinstance(scheduler, str)
+                else " with out and resume=True"
+            )
             raise ConfigurationError(
                 f"the workers ended: {str(error).rstrip('.') or 'no scheduler answers'}; finished runs are kept, and "
                 f"the same call{again} carries out the others; on this machine a run that kills its process is a row"
@@ -436,8 +508,14 @@ def open_workers(
         return
     check_present_folder()
     if limits.memory < math.inf and not can_watch():
-        remark("the memory and the processes of a run cannot be watched here, only its time: /proc does not say them")
-    pool = Pool(count, limits, (*MODULES, *["pandas"] * (steps or foreign), *registry.own_modules(plants, controllers)))
+        remark(
+            "the memory and the processes of a run cannot be watched here, only its time: /proc does not say them"
+        )
+    pool = Pool(
+        count,
+        limits,
+        (*MODULES, *["pandas"] * (steps or foreign), *registry.own_modules(plants, controllers)),
+    )
     try:
         yield Workers(pool.submit, count)
     finally:
@@ -447,15 +525,23 @@ def open_workers(
 @contextlib.contextmanager
 def _open_cluster(scheduler: str) -> Iterator[Executor]:
     if not re.fullmatch(r"(?:[a-z]+://)?\S+:\d+", scheduler):
-        raise ConfigurationError(f"--scheduler needs an address such as tcp://127.0.0.1:8786, got {scheduler!r}")
+        raise ConfigurationError(
+            f"--scheduler needs an address such as tcp://127.0.0.1:8786, got {scheduler!r}"
+        )
     from distributed import Client  # noqa: PLC0415 - only the extra cluster brings it
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it reports the end of a scheduler with traces
+    # It reports the end of a scheduler with traces
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         asyncio.run(_call(scheduler))
         client = Client(scheduler, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, TypeError, MemoryError) as error:  # the bytes of another program may pass for a size
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        MemoryError,
+    ) as error:  # the bytes of another program may pass for a size
         raise ConfigurationError(
             f"the scheduler {scheduler} does not answer; start one with `dask scheduler --host 127.0.0.1` and name "
             "its address"
@@ -481,12 +567,18 @@ async def _call(scheduler: str) -> None:
 def _workers_of(executor: Executor, count: int) -> Workers:
     """Return the workers of an executor, `count` where it does not say how many it has."""
     if isinstance(executor, ThreadPoolExecutor):
-        raise ConfigurationError("an executor must have processes: threads would share the state of solvers and files")
+        raise ConfigurationError(
+            "an executor must have processes: threads would share the state of solvers and files"
+        )
     lost: tuple[type[BaseException], ...] = ()
-    if (dask := sys.modules.get("distributed")) and isinstance(executor, dask.cfexecutor.ClientExecutor):
+    if (dask := sys.modules.get("distributed")) and isinstance(
+        executor, dask.cfexecutor.ClientExecutor
+    ):
         count, lost = sum(executor._client.nthreads().values()) or count, (dask.KilledWorker,)
     count = getattr(executor, "_max_workers", None) or count
-    return Workers(lambda task, _hear=None: executor.submit(_gather, task), count, cluster=True, lost=lost)
+    return Workers(
+        lambda task, _hear=None: executor.submit(_gather, task), count, cluster=True, lost=lost
+    )
 
 
 def _gather(task: Task) -> bytes:

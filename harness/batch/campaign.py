@@ -43,7 +43,13 @@ from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
+from servobench.harness.run.resolution import (
+    ResolvedRun,
+    Sections,
+    check_settings,
+    resolve_sections,
+    select,
+)
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import writing_together
@@ -51,7 +57,8 @@ from servobench.plant.contract.settings import remark
 
 Row = dict[str, Any]
 _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
-NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
+# Entries of a manifest that identify its runs
+NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
 NEEDED: Final = (  # settings, others that they need, and values of these that leave them idle
     (("aids.latency",), {"aids.delay": ("ignored", "identified")}),
@@ -114,13 +121,20 @@ class Execution:
     """How the runs of a campaign are carried out."""
 
     workers: int | None = None  # number of processes; None for the number of processors
-    scheduler: str | Executor | None = None  # Dask's address, or an executor; None for processes of this machine
+    scheduler: str | Executor | None = (
+        None  # Dask's address, or an executor; None for processes of this machine
+    )
     bounds: Bounds = field(default_factory=Bounds)  # resources of a run
     resume: bool = False  # carry out the runs that are missing in the folder
     observer: Observer = field(default_factory=Observer)  # receives the progress
     block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
-    debug: bool = False  # raise the error of a run that crashes; the runs go one by one in this process
-    part: tuple[int, int] = (1, 1)  # (3, 40): the third of forty parts of the runs only, all of about one size
+    debug: bool = (
+        False  # raise the error of a run that crashes; the runs go one by one in this process
+    )
+    part: tuple[int, int] = (
+        1,
+        1,
+    )  # (3, 40): the third of forty parts of the runs only, all of about one size
 
 
 def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) -> None:
@@ -142,17 +156,27 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         check_resumable(folder)
     runs = survey(Grid(attrgetter("request"), campaign.cells))
     if how.part[1] > runs.count:
-        raise ConfigurationError(f"a batch of {runs.count} runs has at most {runs.count} parts, got {how.part[1]}")
+        raise ConfigurationError(
+            f"a batch of {runs.count} runs has at most {runs.count} parts, got {how.part[1]}"
+        )
     own = offered(runs.sections)
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
-    trusted = [name for name, section in campaign.settings.sections.items() if section.get("isolate") is False]
-    opening = open_workers(how.workers, how.scheduler, bounds, **names, own=own, trusted=trusted, steps=campaign.steps)
+    trusted = [
+        name
+        for name, section in campaign.settings.sections.items()
+        if section.get("isolate") is False
+    ]
+    opening = open_workers(
+        how.workers, how.scheduler, bounds, **names, own=own, trusted=trusted, steps=campaign.steps
+    )
     with opening as place:
         _carry_out_at(place, campaign, runs, own, folder, how)
 
 
-def carry_out_parts(parts: Mapping[str, Campaign], folder: Path, how: Execution) -> dict[str, pd.DataFrame]:
+def carry_out_parts(
+    parts: Mapping[str, Campaign], folder: Path, how: Execution
+) -> dict[str, pd.DataFrame]:
     """Carry out the campaigns of a study, each in a folder of its name, and return their tables of runs.
 
     Raises:
@@ -164,26 +188,40 @@ def carry_out_parts(parts: Mapping[str, Campaign], folder: Path, how: Execution)
 
 
 def _carry_out_at(
-    place: Workers, campaign: Campaign, runs: Survey, own: tuple[Offer, ...], folder: Path, how: Execution
+    place: Workers,
+    campaign: Campaign,
+    runs: Survey,
+    own: tuple[Offer, ...],
+    folder: Path,
+    how: Execution,
 ) -> None:
     """Check and carry out a campaign at a place."""
     sections = check_campaign(campaign, runs, how.observer, place)
     together = how.block > 1 and not (how.debug or campaign.steps or campaign.timed)
     jobs = partial(_jobs, campaign, sections, together)
-    side_by_side = _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
-    manifest = describe_batch(runs, sections, campaign.settings.sections, side_by_side, own, steps=campaign.steps)
+    side_by_side = (
+        _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
+    )
+    manifest = describe_batch(
+        runs, sections, campaign.settings.sections, side_by_side, own, steps=campaign.steps
+    )
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
     with locked(folder) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
-        resumed = how.resume and not is_unused(folder)  # under the lock: another process may have begun meanwhile
+        # Under the lock: another process may have begun meanwhile
+        resumed = how.resume and not is_unused(folder)
         if how.resume and not resumed:
             how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
         if resumed:
             restored = restore_manifest(folder, manifest)
-            check_same_batch(folder, manifest, how.observer.note, remedy="give another folder as `out`")
-            for line in [restored] * bool(restored) + list(mend(folder, manifest)):  # before anything is computed
+            check_same_batch(
+                folder, manifest, how.observer.note, remedy="give another folder as `out`"
+            )
+            for line in [restored] * bool(restored) + list(
+                mend(folder, manifest)
+            ):  # before anything is computed
                 how.observer.note(f"note: {line}")
         else:
             results.create_folder(folder, manifest)
@@ -196,7 +234,9 @@ def _carry_out_at(
         results.put_together(folder, manifest)
 
 
-def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: Workers) -> Sections:
+def check_campaign(
+    campaign: Campaign, runs: Survey, observer: Observer, place: Workers
+) -> Sections:
     """Refuse runs that are impossible, before anything is written; networks that are needed are trained.
 
     The examples among the runs are built and thrown away; in a worker process where code of users is built, which may
@@ -223,7 +263,9 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     return sections
 
 
-def check_same_batch(folder: Path, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str) -> None:
+def check_same_batch(
+    folder: Path, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str
+) -> None:
     """Refuse a folder of another batch than that of a manifest; `note` gets a line for each difference that may matter.
 
     Raises:
@@ -232,12 +274,19 @@ def check_same_batch(folder: Path, manifest: Mapping[str, Any], note: Callable[[
     there = results.read_manifest(folder)
     if there.get("campaign") != manifest.get("campaign"):
         other = difference(there, manifest)
-        raise ConfigurationError(f"{folder} holds results of other runs or settings: {other}; {remedy}")
+        raise ConfigurationError(
+            f"{folder} holds results of other runs or settings: {other}; {remedy}"
+        )
     if changed := changed_source(there, manifest):
         raise ConfigurationError(
             f"{folder} was begun with another version of {changed}; {remedy}, or bring the former one back"
         )
-    for key, things in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines"), ("blas", "BLAS")):
+    for key, things in (
+        ("git_commit", "commit"),
+        ("packages", "packages"),
+        ("engines", "engines"),
+        ("blas", "BLAS"),
+    ):
         if there.get(key) != manifest.get(key):
             note(f"note: {folder} was begun with other {things}; later runs may differ")
 
@@ -261,10 +310,13 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
     manifest, found = results.read_manifest(folders[0]), list[tuple[range, Path]]()
     tables = []
     for folder in folders:
-        tables.append(results.load_runs(folder))  # refuses a table of anything else, whose names are of files
+        # Refuses a table of anything else, whose names are of files
+        tables.append(results.load_runs(folder))
         check_same_batch(folder, manifest, note, remedy="leave it away")
         if not (parts := results.finished_runs(folder)):
-            raise ConfigurationError(f"{folder} holds a whole batch, no part; join tables of several with pandas")
+            raise ConfigurationError(
+                f"{folder} holds a whole batch, no part; join tables of several with pandas"
+            )
         found += [(each, folder) for each in parts]
     found.sort(key=lambda pair: pair[0].start)
     for (runs, folder), (others, other) in pairwise(found):
@@ -278,12 +330,16 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
         return results.put_together(partial, manifest)
 
 
-def _jobs(campaign: Campaign, sections: Sections, together: bool, indices: Iterable[int]) -> Iterator[Job]:
+def _jobs(
+    campaign: Campaign, sections: Sections, together: bool, indices: Iterable[int]
+) -> Iterator[Job]:
     """Yield the jobs of some cells; runs that differ in seed only share their settings, and may advance together."""
     for index in indices:
         cell = campaign.cells[index]
         run = select(cell.request, sections)
-        yield Job(index, cell, run, side_by_side_key(run) if together and not cell.picture else None)
+        yield Job(
+            index, cell, run, side_by_side_key(run) if together and not cell.picture else None
+        )
 
 
 def _side_by_side(runs: Iterable[ResolvedRun]) -> dict[str, list[str]]:
@@ -296,11 +352,20 @@ def _side_by_side(runs: Iterable[ResolvedRun]) -> dict[str, list[str]]:
 
 
 def _carry_out_missing(
-    campaign: Campaign, jobs: _MakeJobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
+    campaign: Campaign,
+    jobs: _MakeJobs,
+    own: tuple[Offer, ...],
+    folder: Path,
+    place: Workers,
+    how: Execution,
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out the runs whose part is not in the folder; yield each block with its results."""
-    begin, end = (len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0]))
-    there = (range(max(each.start, begin), min(each.stop, end)) for each in results.finished_runs(folder))
+    begin, end = (
+        len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0])
+    )
+    there = (
+        range(max(each.start, begin), min(each.stop, end)) for each in results.finished_runs(folder)
+    )
     done = list(filter(None, there))  # a block of another part may reach over the borders
     missing = end - begin - sum(map(len, done))
     how.observer.begin(end - begin, end - begin - missing)
@@ -328,7 +393,9 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
         own = [run for run in examples if section in ("run", run.plant, run.controller, run.task)]
         if key == "run.full_jacobian" and not steps:
             why = "this command keeps no steps, which hold the Jacobians"
-        elif key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
+        elif key == "run.camera_moves_at" and not any(
+            run.mismatch.size("camera_move") for run in examples
+        ):
             why = "no mismatch moves the camera, as camera_move=90deg does"
         elif words.startswith("--set") and own and all(run.varies(key) for run in own):
             why = f"all runs vary {key}"
@@ -339,14 +406,21 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
 def _remark_on_idle(settings: Settings, runs: Sequence[ResolvedRun]) -> None:
     """Remark on assignments to settings and variations that count only together with another setting."""
     for section, key, words in _given(settings, [run.request for run in runs]):
-        needed: Mapping[str, tuple[object, ...]] = next((others for keys, others in NEEDED if key in keys), {})
+        needed: Mapping[str, tuple[object, ...]] = next(
+            (others for keys, others in NEEDED if key in keys), {}
+        )
         used = [
             flatten(getattr(run, role))
             for run in runs
             for role in ("plant", "controller")
-            if section == getattr(run.request, role) or (section == role and run.request.varies(f"{role}.{key}"))
+            if section == getattr(run.request, role)
+            or (section == role and run.request.varies(f"{role}.{key}"))
         ]
-        if needed and used and all(each.get(name) in idle for each in used for name, idle in needed.items()):
+        if (
+            needed
+            and used
+            and all(each.get(name) in idle for each in used for name, idle in needed.items())
+        ):
             found = " and ".join(f"{section}.{name} is {used[0][name]}" for name in needed)
             remark(f"{words} has no effect while {found}")
 

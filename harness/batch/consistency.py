@@ -15,7 +15,14 @@ import pandas as pd
 
 from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN, judge_run
-from servobench.harness.run.outcome import FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, OUTCOMES, SETTLED
+from servobench.harness.run.outcome import (
+    FOLLOWED,
+    FOLLOWING_BANDS,
+    NOT_FOLLOWED,
+    NOT_SETTLED,
+    OUTCOMES,
+    SETTLED,
+)
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import COMMAND, PlantSpec
@@ -74,7 +81,9 @@ def _find_within(row: Mapping[str, Any], period: float) -> str:
         if _number(row, name) > largest * (1.0 + TOLERANCE):
             return f"its {name} is larger than its largest error"
     band = _number(row, "settling_band")
-    if length - settling - period >= FINAL_SPAN and _number(row, "steady_state_error") > band * (1.0 + TOLERANCE):
+    if length - settling - period >= FINAL_SPAN and _number(row, "steady_state_error") > band * (
+        1.0 + TOLERANCE
+    ):
         return "its steady_state_error is outside the band in which it settled"
     return ""
 
@@ -96,7 +105,9 @@ def _find_beside(row: Mapping[str, Any], steps: pd.DataFrame, period: float) -> 
         return "its steps are not a period apart"
     with np.errstate(all="ignore"):
         computed = judge_run(logged, row["task_kind"], 0.0)
-        if not np.allclose(logged.error_norm(), steps["error_norm"], rtol=TOLERANCE, equal_nan=True):
+        if not np.allclose(
+            logged.error_norm(), steps["error_norm"], rtol=TOLERANCE, equal_nan=True
+        ):
             return "its error_norm is not that of its steps"
         for name in FROM_STEPS:
             found = float(computed[name])
@@ -110,7 +121,9 @@ def _as_logged(steps: pd.DataFrame, band: float, period: float) -> Steps:
     """Return a table of steps as the log that it was made of, without Jacobians."""
 
     def numbers(kind: str) -> FloatArray:
-        return steps[[name for name in steps.columns if name.startswith(f"{kind}_")]].to_numpy(np.float64)
+        return steps[[name for name in steps.columns if name.startswith(f"{kind}_")]].to_numpy(
+            np.float64
+        )
 
     true_feature = numbers("true_feature")
     command = numbers(COMMAND)

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path("/")
-MEMORY_LIMITS: Final = ("memory.max", "memory.high", "memory.limit_in_bytes")  # the last is that of version 1
+# The last is that of version 1
+MEMORY_LIMITS: Final = ("memory.max", "memory.high", "memory.limit_in_bytes")
 
 
 def memory_limit(root: Path = ROOT) -> float:
@@ -61,6 +62,8 @@ def _groups(root: Path) -> Iterator[Path]:
 def _numbers(file: Path) -> list[float]:
     """Return the numbers in a file, infinity for its word max; none where there is no such file."""
     try:
-        return [float(word.replace("max", "inf")) for word in file.read_text(encoding="ascii").split()]
+        return [
+            float(word.replace("max", "inf")) for word in file.read_text(encoding="ascii").split()
+        ]
     except (OSError, ValueError):
         return []

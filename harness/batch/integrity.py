@@ -18,7 +18,8 @@ from servobench.plant.contract.files import PARTIAL
 
 AGAIN: Final = "repeat the command that made the folder with --resume"
 REMADE: Final = (
-    "servobench report makes the page anew; the rest comes with the runs, from the same command in a new folder"
+    "servobench report makes the page anew; the rest comes with the runs, "
+    "from the same command in a new folder"
 )
 
 
@@ -59,23 +60,41 @@ def examine(folder: Path) -> Examination:
         raise
     except ConfigurationError as error:
         unread = error.fault if isinstance(error, DamagedFile) else "cannot be read"
-        findings.append(Finding(MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"))
+        findings.append(
+            Finding(
+                MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"
+            )
+        )
     if sums_of(folder) is None:
         remedy = f"if you trust the files as they are: cd {folder} && sha256sum {MANIFEST} *.parquet > {SUMS}"
-        findings.append(Finding(SUMS, "is missing, so that nothing vouches for the other files", remedy))
+        findings.append(
+            Finding(SUMS, "is missing, so that nothing vouches for the other files", remedy)
+        )
     names = [name for name in (RUNS, STEPS, FAILURES) if results.is_expected(folder, name)]
     faults = {name: wrong for name in names if (wrong := _fault(folder, name))}
     for name, wrong in faults.items():
-        remedy = "it is written anew, without traces" if name == FAILURES else "runs that are in no part are repeated"
+        remedy = (
+            "it is written anew, without traces"
+            if name == FAILURES
+            else "runs that are in no part are repeated"
+        )
         findings.append(Finding(name, wrong, f"{AGAIN}; {remedy}"))
     count = 0
     for part in _parts(folder, manifest):
         names += part.names
         count += part.count
         if part.fault:
-            findings.append(Finding(part.wrong, part.fault, f"{AGAIN}; only the runs of this part are repeated"))
-    strays = [path.name for path in sorted((folder / PARTS).glob("[!.]*")) if not PART.fullmatch(path.name)]
-    findings += [Finding(f"{PARTS}/{name}", "is no file of a batch", "move it elsewhere") for name in strays]
+            findings.append(
+                Finding(part.wrong, part.fault, f"{AGAIN}; only the runs of this part are repeated")
+            )
+    strays = [
+        path.name
+        for path in sorted((folder / PARTS).glob("[!.]*"))
+        if not PART.fullmatch(path.name)
+    ]
+    findings += [
+        Finding(f"{PARTS}/{name}", "is no file of a batch", "move it elsewhere") for name in strays
+    ]
     if RUNS in names and not faults.keys() & {RUNS, STEPS}:
         count = max(count, tables.row_count(folder, RUNS))
     if count and not findings:
@@ -84,7 +103,9 @@ def examine(folder: Path) -> Examination:
         if wrong := results.file_fault(folder, name):
             findings.append(Finding(name, wrong, REMADE))
     left_out = [name for name in results.unlisted(folder) if name not in names and name != MANIFEST]
-    return Examination(findings, len(names) + 1 + len(beside), count, manifest.get("run_count", 0), left_out)
+    return Examination(
+        findings, len(names) + 1 + len(beside), count, manifest.get("run_count", 0), left_out
+    )
 
 
 def check_resumable(folder: Path) -> None:
@@ -112,7 +133,9 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
         for part in _parts(folder, manifest):
             if part.fault:
                 yield f"{folder / part.wrong} {part.fault}: its runs are carried out again"
-                for name in reversed(part.names):  # the rows first: without them the part does not count
+                for name in reversed(
+                    part.names
+                ):  # the rows first: without them the part does not count
                     (folder / name).unlink(missing_ok=True)
             else:
                 kept |= {name: frozenset([digest(folder / name)]) for name in part.names}
@@ -125,7 +148,10 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
             if wrong and name in (RUNS, STEPS):
                 yield f"{folder / name} {wrong}: runs that are in no part are carried out again"
         keep_sums(folder, kept | results.accompanying(folder))
-        for path in (*folder.glob(".*"), *(folder / PARTS).glob(".*")):  # remains of a process that was killed
+        for path in (
+            *folder.glob(".*"),
+            *(folder / PARTS).glob(".*"),
+        ):  # remains of a process that was killed
             if PARTIAL.fullmatch(path.name):
                 path.unlink()
         if not results.is_whole(folder, manifest["run_count"]):
@@ -133,7 +159,9 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
             return
         if FAILURES in kept and (wrong := results.file_fault(folder, FAILURES)):
             yield f"{folder / FAILURES} {wrong}: it is written anew, without traces"
-            write_vouched(folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")})
+            write_vouched(
+                folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")}
+            )
 
 
 def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
@@ -225,5 +253,7 @@ def _fault(folder: Path, name: str) -> str | None:
 def _log(folder: Path) -> str:
     """Return the log of failures as far as it can be made from the table of runs."""
     groups = tables.row_groups(folder, RUNS, ("run_id", "status", "reason"))
-    rows = (dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy())
+    rows = (
+        dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy()
+    )
     return "".join(log_entry(row, "") for row in rows)

@@ -25,7 +25,9 @@ from servobench.plant.contract.files import PARTIAL, accessing, harmless
 
 LOCK = ".lock"
 PARTS: Final = "parts"
-NAME_TIMEOUT: Final = 1.0  # [s] for which a refused process waits until the holder has written its name
+NAME_TIMEOUT: Final = (
+    1.0  # [s] for which a refused process waits until the holder has written its name
+)
 NAME_POLL: Final = 0.01  # [s]
 
 
@@ -85,7 +87,9 @@ class Lock:
             FileNotFoundError: the folder was removed, or removed and made again by another process.
         """
         if not _same(self.file, self.descriptor):
-            raise FileNotFoundError(errno.ENOENT, "it was removed by another process", str(self.file.parent))
+            raise FileNotFoundError(
+                errno.ENOENT, "it was removed by another process", str(self.file.parent)
+            )
 
 
 @contextlib.contextmanager
@@ -142,7 +146,9 @@ def _acquire(path: Path) -> tuple[int, Holder | None]:
             # The holder may give the lock back while its name is awaited; then the lock is free again.
             if _same(path, descriptor):
                 who = holder or before or "a process that did not write its name"
-                raise ConfigurationError(f"results folder {path.parent} is being written by {who}") from None
+                raise ConfigurationError(
+                    f"results folder {path.parent} is being written by {who}"
+                ) from None
         except OSError as error:
             raise ConfigurationError(
                 f"results folder {path.parent} lies on a file system without locks ({error.strerror}), as some "
@@ -197,12 +203,16 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
     """
     if any("\ud800" <= letter <= "\udfff" for letter in str(folder)):
         encoding = sys.getfilesystemencoding()
-        raise ConfigurationError(f"results folder {folder}: its name is no {encoding}; give another one as `out`")
+        raise ConfigurationError(
+            f"results folder {folder}: its name is no {encoding}; give another one as `out`"
+        )
     with accessing(folder, "results folder"):
         taken = not is_unused(folder)
     if taken:
         resume = ", or continue its batch with `resume`" if can_resume and folder.is_dir() else ""
-        raise ConfigurationError(f"results folder {folder} exists already; give another one as `out`{resume}")
+        raise ConfigurationError(
+            f"results folder {folder} exists already; give another one as `out`{resume}"
+        )
 
 
 def refuse_links(folder: Path) -> None:
@@ -216,12 +226,16 @@ def refuse_links(folder: Path) -> None:
         with contextlib.suppress(OSError), os.scandir(waiting.pop()) as inside:
             for entry in inside:
                 if harmless(entry.name) != entry.name or "\n" in entry.name:
-                    raise ConfigurationError(f"{folder} holds a file whose name cannot be printed, {entry.name!a}")
+                    raise ConfigurationError(
+                        f"{folder} holds a file whose name cannot be printed, {entry.name!a}"
+                    )
                 if entry.is_dir(follow_symlinks=False):
                     waiting.append(entry.path)
                 elif not entry.is_file(follow_symlinks=False):
                     found = f"{entry.path} is {'a link' if entry.is_symlink() else 'no file'}"
-                    raise ConfigurationError(f"{found}, and a results folder holds files only; put a copy in its place")
+                    raise ConfigurationError(
+                        f"{found}, and a results folder holds files only; put a copy in its place"
+                    )
 
 
 def is_unused(folder: Path) -> bool:

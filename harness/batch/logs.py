@@ -23,11 +23,14 @@ from servobench.plant.robot.mismatch import Mismatch
 TABLES: Final = (".csv", ".parquet")  # suffixes
 MAX_PERIOD: Final = 2.0  # [s] between rows of a log
 USUAL_PERIODS: Final = (9e-4, 0.9)  # [s] likewise
-FIT_MARGIN: Final = 1.5  # [1] times the tolerance, as the fitted steps of a short log are off themselves
+FIT_MARGIN: Final = (
+    1.5  # [1] times the tolerance, as the fitted steps of a short log are off themselves
+)
 PER_SECOND: Final = {"ms": 1e3, "µs": 1e6, "ns": 1e9}  # counts of a clock
 TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
-CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.(?i:py)(:|$)")  # in names of plants, controllers and set-ups
+# In names of plants, controllers and set-ups
+CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.(?i:py)(:|$)")
 TASK: Final = "circle"  # likewise, without effect
 RENAMED: Final = {  # counts of control periods up to 0.2.0 -> times
     f"initial.{word}_periods": f"initial.{word}_time" for word in ("probe", "settle", "average")
@@ -48,7 +51,9 @@ def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
     results.check_steps(folder)
     names = runs["run_id"].tolist()
     if run_id is None and len(names) > 1:
-        raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")
+        raise ConfigurationError(
+            f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}"
+        )
     chosen = run_id or names[0]
     if chosen not in names:
         raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
@@ -73,13 +78,22 @@ def logged_in_folder(
     row, manifest = find_run(folder, run_id), results.read_manifest(folder)
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
         name = str(row.get(word, ""))
-        place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")  # of the user's code, whose name may be any
+        # of the user's code, whose name may be any
+        place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")
         if place or (CODE.search(name) and name != sensing):
-            remedy = "nothing that a folder names is run" if word == "plant" else f"name it by --{word} if you trust it"
-            raise ConfigurationError(f"{folder} names code that would be run, {word} {place or name}; {remedy}")
+            remedy = (
+                "nothing that a folder names is run"
+                if word == "plant"
+                else f"name it by --{word} if you trust it"
+            )
+            raise ConfigurationError(
+                f"{folder} names code that would be run, {word} {place or name}; {remedy}"
+            )
     steps = results.load_steps(folder, [row["run_id"]])
     if steps.empty:
-        raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
+        raise ConfigurationError(
+            f"run {row['run_id']} has no steps: it ended before its first period"
+        )
     names = ("plant", "task", "mismatch", "robot", "sensing")
     own = row.get("robot") == OWN_ROBOT  # which comes with the plant
     asked = {name: row[name] for name in names if name in row and not (own and name == "robot")}
@@ -87,7 +101,9 @@ def logged_in_folder(
         varied = varied_in_row(row)
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
-    request = RunRequest(controller=controller or row["controller"], seed=int(row["seed"]), varied=varied, **asked)
+    request = RunRequest(
+        controller=controller or row["controller"], seed=int(row["seed"]), varied=varied, **asked
+    )
     return resolve(request, _settings_of(request, manifest, own=not controller)), steps
 
 
@@ -96,7 +112,11 @@ def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool)
 
     Those of the plant are the ones that the run did not have by default or by its mismatch.
     """
-    told, changed, name = manifest.get("configuration", {}), manifest.get("changed") or {}, request.plant
+    told, changed, name = (
+        manifest.get("configuration", {}),
+        manifest.get("changed") or {},
+        request.plant,
+    )
     read = ["run", name, request.task, *([request.controller] if own else [])]
     common = told.get("run", {}).get("period", RunSettings.period)
     period = dict(request.varied).get("run.period", common)
@@ -114,7 +134,9 @@ def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool)
     return Settings({each: nest(values) for each, values in flat.items()})
 
 
-def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tuple[ResolvedRun, pd.DataFrame]:
+def logged_in_file(
+    path: Path, controller: str, robot: str, sensing: str
+) -> tuple[ResolvedRun, pd.DataFrame]:
     """Return a log of one's own, of which robot and sensing are known, and a run of a controller on them.
 
     Args:
@@ -127,10 +149,13 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
         ConfigurationError: a file that cannot be read, or a name that cannot be used.
     """
     if path.suffix.lower() not in TABLES:
-        raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(TABLES)}")
+        raise ConfigurationError(
+            f"{path} must be a results folder, or a table in {' or '.join(TABLES)}"
+        )
     table = read_table("log", path)
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
-    settings = {"run": {"period": _period(path, table)}, PLANT: {"command_delay": 0.0}}  # which any period divides
+    # Which any period divides
+    settings = {"run": {"period": _period(path, table)}, PLANT: {"command_delay": 0.0}}
     return resolve(request, Settings(settings)), table
 
 
@@ -140,11 +165,17 @@ def _period(path: Path, table: pd.DataFrame) -> float:
     steps = np.diff(times)
     usual = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0
     if not 0.0 < usual <= MAX_PERIOD:
-        units = [f"{unit}: divide it by {count:g}" for unit, count in PER_SECOND.items() if 1e-3 <= usual / count < 1.0]
+        units = [
+            f"{unit}: divide it by {count:g}"
+            for unit, count in PER_SECOND.items()
+            if 1e-3 <= usual / count < 1.0
+        ]
         needed = f"it needs two or more, and time_s in s, not in {next(iter(units), 'ms')}"
         raise ConfigurationError(f"log {path} has {len(times)} rows, {usual:g} s apart; {needed}")
     if not USUAL_PERIODS[0] < usual < USUAL_PERIODS[1]:
-        remark(f"rows of {path.name} are {usual:.3g} s apart: time_s is in s, no count of rows or minutes")
+        remark(
+            f"rows of {path.name} are {usual:.3g} s apart: time_s is in s, no count of rows or minutes"
+        )
     mean = float(np.mean(steps))
     tolerance = min(TIME_TOLERANCE, usual / 8.0)
     late = np.abs(times - times[0] - mean * np.arange(len(times))) > tolerance

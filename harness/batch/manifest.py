@@ -11,7 +11,13 @@ from typing import Any
 
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
-from servobench.harness.config.registry import CONTROLLER_REGISTRY, MAPPED, PLANT_REGISTRY, Offer, find_plant
+from servobench.harness.config.registry import (
+    CONTROLLER_REGISTRY,
+    MAPPED,
+    PLANT_REGISTRY,
+    Offer,
+    find_plant,
+)
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
 from servobench.harness.run.request import find_robot, find_sensing, sensing_file, sensing_place
@@ -24,7 +30,8 @@ PACKAGES = (
     "servobench", "numpy", "scipy", "pandas", "pyarrow", "pybullet", "mujoco", "control", "casadi", "fmpy",
     "opencv-python-headless",
 )  # fmt: skip
-OWN = {"controller": "own_controllers", "plant": "own_plants", "task": "own_tasks"}  # keys of code of users, by kind
+# Keys of code of users, by kind
+OWN = {"controller": "own_controllers", "plant": "own_plants", "task": "own_tasks"}
 
 
 def describe_batch(
@@ -53,17 +60,24 @@ def describe_batch(
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
-        **{key: {each.name: each.record() for each in own if each.word == word} for word, key in OWN.items()},
+        **{
+            key: {each.name: each.record() for each in own if each.word == word}
+            for word, key in OWN.items()
+        },
         "plugins": dict(plugins(runs)),
         "files": named_files(runs, configuration, own),
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "robots": [describe_robot(name) for name in runs.robots],
         "sensings": [describe_sensing(word) for word in runs.sensings],
-        "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
+        "seeds": ",".join(
+            f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds
+        ),
         "configuration": configuration,
         "changed": flatten(changed),
-        "engines": {name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine},
+        "engines": {
+            name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine
+        },
         "packages": {name: installed_version(name) for name in PACKAGES},
         "blas": blas_libraries(),
         "python": platform.python_version(),
@@ -78,11 +92,26 @@ def describe_batch(
 
 def plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield names of controllers, plants and tasks that others have installed, and the record of each."""
-    kinds = (CONTROLLER_REGISTRY, runs.controllers), (PLANT_REGISTRY, runs.plants), (TASK_REGISTRY, runs.tasks)
-    for name, point in ((name, registry.published(name)) for registry, names in kinds for name in names):
+    kinds = (
+        (CONTROLLER_REGISTRY, runs.controllers),
+        (PLANT_REGISTRY, runs.plants),
+        (TASK_REGISTRY, runs.tasks),
+    )
+    for name, point in (
+        (name, registry.published(name)) for registry, names in kinds for name in names
+    ):
         if point is not None:
-            made = f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
-            yield name, {"place": point.value, "distribution": made, "sha256": digest_of_module(point.module)}
+            made = (
+                f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
+            )
+            yield (
+                name,
+                {
+                    "place": point.value,
+                    "distribution": made,
+                    "sha256": digest_of_module(point.module),
+                },
+            )
 
 
 def describe_sensing(word: str) -> dict[str, Any]:
@@ -108,10 +137,19 @@ def describe_robot(name: str) -> dict[str, Any]:
     }
     listed = {key: value.tolist() for key, value in numbers.items()}
     camera = {} if robot.camera is None else {"camera": asdict(robot.camera.keys)}
-    return {"name": name, "title": robot.title, "source": robot.source, "note": robot.note, **listed, **camera}
+    return {
+        "name": name,
+        "title": robot.title,
+        "source": robot.source,
+        "note": robot.note,
+        **listed,
+        **camera,
+    }
 
 
-def named_files(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]) -> dict[str, str]:
+def named_files(
+    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]
+) -> dict[str, str]:
     """Return the SHA-256 of each file by its name, as the user wrote it.
 
     Args:
@@ -130,20 +168,26 @@ def named_files(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], ow
     return {name: digest(path) for name, path in found.items() if path.is_file()}
 
 
-def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]) -> Iterator[str]:
+def _names(
+    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]
+) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
     yield from (read_word(name).robot for name in runs.robots)
     for camera in (find_robot(name).camera for name in runs.robots):
         yield from () if camera is None else map(str, camera.files)
     yield from filter(None, (each.mismatch.calibration for each in runs.examples))
     for values in configuration.values():
-        yield from (str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value)
+        yield from (
+            str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value
+        )
     for name in (*runs.plants, *runs.controllers, *(each.place for each in own)):
         if name.startswith(MAPPED):
             path = name.removeprefix(MAPPED)
             yield path
             if path.lower().endswith(".toml"):
-                yield str(Path(path).parent / str(read_toml("mapping", user_path(path)).get("file", "")))
+                yield str(
+                    Path(path).parent / str(read_toml("mapping", user_path(path)).get("file", ""))
+                )
 
 
 def _code(place: str, file: Path) -> dict[str, Path]:

@@ -20,7 +20,14 @@ from typing import Any, Final, Generic, Self, TypeVar, overload
 import numpy as np
 
 from servobench.harness.config.registry import find_plant
-from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
+from servobench.harness.run.request import (
+    DEFAULT_ROBOT,
+    SHORT_NAMES,
+    RunRequest,
+    Value,
+    Varied,
+    read_mismatch,
+)
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import parse_toml, split_words
@@ -54,14 +61,22 @@ class Batch:
         is_default = self.mismatches == (DEFAULT_MISMATCH,)
         own = {plant for plant in self.plants if is_default and find_plant(plant).own_robot}
 
-        def run(sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
+        def run(
+            sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
+        ) -> RunRequest:
             if plant in own:
-                remark(f"plant {plant} has a robot of its own: the mismatch moderate stands for none there")
+                remark(
+                    f"plant {plant} has a robot of its own: the mismatch moderate stands for none there"
+                )
                 mismatch = Mismatch()
-            return RunRequest(plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing)
+            return RunRequest(
+                plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing
+            )
 
         mismatches = [read_mismatch(text) for text in self.mismatches]
-        return Grid(run, self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds)
+        return Grid(
+            run, self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
+        )
 
 
 def parse_seeds(text: str) -> Sequence[int]:
@@ -80,7 +95,9 @@ def parse_seeds(text: str) -> Sequence[int]:
         else:
             seeds = range(max(0, int(text)))
     except ValueError as error:
-        raise ConfigurationError(f"seeds must be a count (5), a list (3,1,4) or a range (100:120), {came}") from error
+        raise ConfigurationError(
+            f"seeds must be a count (5), a list (3,1,4) or a range (100:120), {came}"
+        ) from error
     return check_seeds(seeds, came)
 
 
@@ -95,15 +112,20 @@ def check_seeds(seeds: Sequence[int], came: str) -> Sequence[int]:
         ConfigurationError: none, too many, one negative, too large or named twice.
     """
     if isinstance(seeds, range):
-        first, last, size = seeds.start, seeds.stop - 1, seeds.stop - seeds.start  # len() ends at 2**63
+        # len() ends at 2**63
+        first, last, size = (seeds.start, seeds.stop - 1, seeds.stop - seeds.start)
     else:
         first, last, size = min(seeds, default=-1), max(seeds, default=-1), len(seeds)
     if first < 0 or last < first:
-        raise ConfigurationError(f"seeds must name at least one seed, none of them negative; {came}")
+        raise ConfigurationError(
+            f"seeds must name at least one seed, none of them negative; {came}"
+        )
     if last > MAX_SEED:
         raise ConfigurationError(f"seeds must be at most {MAX_SEED}, {came}")
     if size > MAX_SEEDS:
-        raise ConfigurationError(f"seeds must name at most {MAX_SEEDS:,}, {came}; use several folders for more")
+        raise ConfigurationError(
+            f"seeds must name at most {MAX_SEEDS:,}, {came}; use several folders for more"
+        )
     for seed, count in Counter(seeds).items() if isinstance(seeds, tuple) else ():
         if count > 1:
             raise ConfigurationError(f"seeds name {seed} twice, {came}")
@@ -144,7 +166,9 @@ class Cell:
     """A run and its further columns in the table of runs."""
 
     request: RunRequest
-    columns: Mapping[str, Any] = field(default_factory=dict)  # such as the place along the axis that a sweep varies
+    columns: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # such as the place along the axis that a sweep varies
     picture: bool = False  # keep the last picture of the camera
 
 
@@ -194,8 +218,12 @@ class SweepPlan:
     """
 
     batch: Batch  # plants, controllers, tasks, mismatches and seeds
-    axes: tuple[tuple[str, tuple[Magnitude, ...]], ...] = ()  # of the mismatch, with their magnitudes
-    settings: tuple[tuple[str, tuple[Value, ...]], ...] = ()  # by short name or `SECTION.KEY`, with their values
+    axes: tuple[
+        tuple[str, tuple[Magnitude, ...]], ...
+    ] = ()  # of the mismatch, with their magnitudes
+    settings: tuple[
+        tuple[str, tuple[Value, ...]], ...
+    ] = ()  # by short name or `SECTION.KEY`, with their values
 
     @classmethod
     def parse(cls, batch: Batch, variations: Iterable[str]) -> Self:
@@ -230,16 +258,23 @@ class SweepPlan:
         for axis, _ in self.axes:
             for text in self.batch.mismatches:
                 if axis in dict(read_mismatch(text).axes):
-                    raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
+                    raise ConfigurationError(
+                        f"--vary {axis} varies an axis that the mismatch {text!r} has"
+                    )
 
         def cell(place: Place, varied: Varied, request: RunRequest) -> Cell:
             if place.magnitude is not None or varied:
                 request = replace(request, mismatch=place.vary(request.mismatch), varied=varied)
             return Cell(request, place.columns)
 
-        places = [Place(axis, magnitude) for axis, magnitudes in self.axes for magnitude in magnitudes]
+        places = [
+            Place(axis, magnitude) for axis, magnitudes in self.axes for magnitude in magnitudes
+        ]
         names = [name for name, _ in self.settings]
-        varied = Grid(lambda *values: tuple(zip(names, values, strict=True)), *(values for _, values in self.settings))
+        varied = Grid(
+            lambda *values: tuple(zip(names, values, strict=True)),
+            *(values for _, values in self.settings),
+        )
         return Grid(cell, places or [Place()], varied, self.batch.requests())
 
 
@@ -253,12 +288,18 @@ class Place:
     @cached_property
     def columns(self) -> dict[str, Any]:
         """The columns of the table of runs that say so; empty and NaN without an axis."""
-        number, unit = (math.nan, "") if self.magnitude is None else (self.magnitude.number, self.magnitude.unit)
+        number, unit = (
+            (math.nan, "")
+            if self.magnitude is None
+            else (self.magnitude.number, self.magnitude.unit)
+        )
         return {"axis": self.axis, "magnitude": number, "unit": unit}
 
     def vary(self, mismatch: Mismatch) -> Mismatch:
         """Return a mismatch with the axis put on top of it."""
-        return mismatch if self.magnitude is None else _with_axis(mismatch, self.axis, self.magnitude)
+        return (
+            mismatch if self.magnitude is None else _with_axis(mismatch, self.axis, self.magnitude)
+        )
 
 
 @lru_cache
@@ -286,13 +327,18 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
         except (ValueError, RecursionError):
             words = split_words(text)
             parts = [split_quantity(word) for word in words]
-            values = [part[0] if part and not part[1] else word for part, word in zip(parts, words, strict=True)]
+            values = [
+                part[0] if part and not part[1] else word
+                for part, word in zip(parts, words, strict=True)
+            ]
     numeric = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)
     if numeric and any(isinstance(each, float) for each in values):
         values = [float(each) for each in values]
     found = _in_one_way(name, values)
     if not found or "" in found:
-        raise ValueError(f"{name} needs values, such as run.period=0.02,0.05 or task.duration=2:8:2")
+        raise ValueError(
+            f"{name} needs values, such as run.period=0.02,0.05 or task.duration=2:8:2"
+        )
     sizes = [_size(each) for each in found]
     for k, each in enumerate(found):
         if sizes[k] in sizes[:k]:
@@ -306,14 +352,18 @@ def _in_one_way(name: str, values: Sequence[Any]) -> tuple[Value, ...]:
     unit = next((parts[1] for parts in map(split_quantity, texts) if parts), "")
     found = tuple(f"0{unit}" if texts and unit and each == 0 else each for each in values)
     if texts and not all(isinstance(each, str) for each in found):
-        raise ValueError(f"{name} mixes numbers and texts; write the unit with all values, or with none")
+        raise ValueError(
+            f"{name} mixes numbers and texts; write the unit with all values, or with none"
+        )
     return found
 
 
 def _size(value: Value) -> object:
     """Return a value for comparison: a quantity with a unit in its base unit, so that 2s and 2000ms are equal."""
     parts = split_quantity(value) if isinstance(value, str) else None
-    own = next((own for own, units in UNITS.items() if parts and parts[1] and parts[1] in units), "")
+    own = next(
+        (own for own, units in UNITS.items() if parts and parts[1] and parts[1] in units), ""
+    )
     return (own, round(in_own_unit(*parts, own), 12)) if parts and own else value
 
 
@@ -359,12 +409,18 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         if kind == last:
             continue
         own = request.controller, request.varied_in("controller")
-        new = {(request.plant, condition), (request.plant, *own), (request.task, request.varied_in("task"))} - seen
+        new = {
+            (request.plant, condition),
+            (request.plant, *own),
+            (request.task, request.varied_in("task")),
+        } - seen
         if new:
             seen |= new
             found.examples.append(request)
     for example in found.examples:
-        found.plants[example.plant] = found.controllers[example.controller] = found.tasks[example.task] = None
+        found.plants[example.plant] = found.controllers[example.controller] = found.tasks[
+            example.task
+        ] = None
         found.mismatches[str(example.mismatch)] = found.sensings[example.sensing] = None
         if not find_plant(example.plant).own_robot:
             found.robots[example.robot] = None
@@ -381,7 +437,9 @@ def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> No
         name, count = names.most_common(1)[0]
         if count > 1:
             name = next(request.run_id for request in requests if request.run_id.casefold() == name)
-            raise ConfigurationError(f"the run {name} is asked for twice: leave one out, or rename a file (NAME=FILE)")
+            raise ConfigurationError(
+                f"the run {name} is asked for twice: leave one out, or rename a file (NAME=FILE)"
+            )
 
 
 def _ranges(numbers: array[int]) -> list[range]:

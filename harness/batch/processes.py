@@ -32,11 +32,14 @@ LINUX: Final = sys.platform == "linux"  # of the other systems, macOS is provide
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 KEPT_MEMORY: Final = 2**30  # [bytes] of freed memory that a worker keeps
-LARGEST_BLOCK: Final = 2**25  # [bytes] from which on a block has pages of its own; glibc takes no larger threshold
+# [bytes] from which on a block has pages of its own; glibc takes no larger threshold
+LARGEST_BLOCK: Final = 2**25
 FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
 FOREIGN_SHARE: Final = 0.8  # share of the memory for all concurrent runs of foreign code
-LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least, on a machine that is no container
-END_TIME, END_PAUSE = 5.0, 0.01  # [s] until all processes below this one have ended, and between two checks
+# [bytes] for each of them at least, on a machine that is no container
+LEAST_FOREIGN_MEMORY: Final = 2 * 10**9
+# [s] until all processes below this one have ended, and between two checks
+END_TIME, END_PAUSE = (5.0, 0.01)
 STAND_PAUSE: Final = 0.05  # [s] between two looks at a child that may be stopped
 OWN_TIME: Final = 1.0  # [s] for a child to end by itself once the parent has ended
 
@@ -47,15 +50,21 @@ class Limits:
 
     time: float = math.inf  # [s] from one answer to the next
     memory: float = math.inf  # [bytes] of a run and the processes that it starts
-    addresses: bool = False  # refuse each process more than this memory at once, even if it never touches it
+    addresses: bool = (
+        False  # refuse each process more than this memory at once, even if it never touches it
+    )
 
 
 @dataclass(frozen=True)
 class Bounds:
     """Resources of the runs of a batch as a user gives them, and whether code of users stays out of this process."""
 
-    run_timeout: float | None = None  # [s] time limit of a run, inf for none; None for the usual one
-    run_memory: float | None = None  # [bytes] memory limit of a run, inf for none; None for the usual one
+    run_timeout: float | None = (
+        None  # [s] time limit of a run, inf for none; None for the usual one
+    )
+    run_memory: float | None = (
+        None  # [bytes] memory limit of a run, inf for none; None for the usual one
+    )
     isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in sandboxes
 
     def limits(self, count: int, *, foreign: bool) -> Limits:
@@ -71,7 +80,9 @@ def _foreign_memory(count: int) -> float:
     machine = float(psutil.virtual_memory().total)
     memory = FOREIGN_SHARE * min(machine, memory_limit())
     share = memory / count
-    if memory_limit() < machine:  # A container ends processes at its limit, whereas a machine can swap.
+    if (
+        memory_limit() < machine
+    ):  # A container ends processes at its limit, whereas a machine can swap.
         return share
     return max(share, min(LEAST_FOREIGN_MEMORY, memory))
 
@@ -148,7 +159,8 @@ def _stand_over(child: int) -> NoReturn:
 
     Nothing below this process outlives it.
     """
-    os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])  # the child's end of its link must be the only one
+    # The child's end of its link must be the only one
+    os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
     signal.signal(signal.SIGTERM, lambda *_: send([child], signal.SIGTERM))
     parent = parent_process()
     deadline = math.inf
@@ -268,7 +280,8 @@ def limit_resources(memory: float) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     if memory < math.inf and LINUX:
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        soft = min(psutil.Process().memory_info().vms + int(memory), sys.maxsize)  # the largest number of the system
+        # The largest number of the system
+        soft = min(psutil.Process().memory_info().vms + int(memory), sys.maxsize)
         if hard == resource.RLIM_INFINITY or soft < hard:
             resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
@@ -324,7 +337,9 @@ def read_size(text: str) -> float:
         return math.inf
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)i?B\s*", text, re.IGNORECASE)
     if found is None or not float(found[1]):
-        raise ValueError(f"a memory limit is a size such as 500MB or 2GB, or inf for none; got {text!r}")
+        raise ValueError(
+            f"a memory limit is a size such as 500MB or 2GB, or inf for none; got {text!r}"
+        )
     return int(float(found[1]) * 1000 ** " KMGT".index(found[2].upper() or " "))
 
 

@@ -22,10 +22,23 @@ import pyarrow.dataset as ds
 
 from servobench.harness.batch import tables
 from servobench.harness.batch.lock import LOCK, PARTS, check_empty, refuse_links
-from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
+from servobench.harness.batch.tables import (
+    DamagedFile,
+    refuse_lacking,
+    refuse_nameless,
+    sums_of,
+    writing,
+)
 from servobench.harness.config.description import plain
 from servobench.harness.run.result import NETWORKS, RunResult, log_entry
-from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, keep_sums, write_vouched
+from servobench.plant.contract.checksums import (
+    SUMS,
+    append_sums,
+    digest,
+    fault,
+    keep_sums,
+    write_vouched,
+)
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
 
@@ -34,7 +47,9 @@ RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 FAILURES = "failures.log"
 MANIFEST = "manifest.json"
-PART: Final = re.compile(rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})")
+PART: Final = re.compile(
+    rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})"
+)
 
 
 def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
@@ -79,7 +94,9 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     files: dict[str, Callable[[Path], object]] = {}
     if steps:
         frame = pa.Table.from_pandas(pd.concat(steps, ignore_index=True), preserve_index=False)
-        files[part_name(index, STEPS)] = partial(tables.write_table, frame.replace_schema_metadata())
+        files[part_name(index, STEPS)] = partial(
+            tables.write_table, frame.replace_schema_metadata()
+        )
     if failures:
         files[part_name(index, FAILURES)] = _text(failures)
     rows = tables.as_table([result.row for result in outcome])
@@ -144,8 +161,12 @@ def copy_parts(parts: Iterable[tuple[Path, int]], other: Path) -> None:
         names = [name for name in names if is_expected(folder, name)]
         _refuse_damaged(folder, names)
         if (folder / PICTURES).is_dir():
-            runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))["run_id"]
-            names = [name for run in runs if (folder / (name := f"{PICTURES}/{run}.png")).is_file()] + names
+            runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))[
+                "run_id"
+            ]
+            names = [
+                name for run in runs if (folder / (name := f"{PICTURES}/{run}.png")).is_file()
+            ] + names
         names += [f"{NETWORKS}/{path.name}" for path in sorted((folder / NETWORKS).glob("*.npz"))]
         files |= {name: partial(shutil.copyfile, folder / name) for name in names}
     with writing(other):
@@ -157,12 +178,19 @@ def copy_parts(parts: Iterable[tuple[Path, int]], other: Path) -> None:
 
 def finished_runs(folder: Path) -> list[range]:
     """Return the indices of the runs whose part is there, in order."""
-    return [range(own, own + tables.row_count(folder, part_name(own, RUNS))) for own in part_indices(folder)]
+    return [
+        range(own, own + tables.row_count(folder, part_name(own, RUNS)))
+        for own in part_indices(folder)
+    ]
 
 
 def is_whole(folder: Path, wanted: int) -> bool:
     """Return whether the tables of a folder are undamaged, and have at least as many runs as are wanted."""
-    if any(file_fault(folder, name) for name in (RUNS, STEPS) if name == RUNS or is_expected(folder, name)):
+    if any(
+        file_fault(folder, name)
+        for name in (RUNS, STEPS)
+        if name == RUNS or is_expected(folder, name)
+    ):
         return False
     with contextlib.suppress(DamagedFile):
         return tables.row_count(folder, RUNS) >= wanted
@@ -197,7 +225,9 @@ def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
         names = part_names(folder, kind)
         _refuse_damaged(folder, names)
         if names and kind == FAILURES:
-            files[kind] = _text("".join((folder / name).read_text(encoding="utf-8") for name in names))
+            files[kind] = _text(
+                "".join((folder / name).read_text(encoding="utf-8") for name in names)
+            )
         elif names:
             files[kind] = partial(tables.join, folder, names, campaign)
     with writing(folder):
@@ -214,16 +244,27 @@ def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
 def vouch(folder: Path, paths: Sequence[Path]) -> None:
     """Write down the checksums of files that accompany the tables, such as figures, where the folder has checksums."""
     if (sums := sums_of(folder)) is not None:
-        digests = {f"{path.relative_to(folder)}": digest(path) for path in paths if path.is_relative_to(folder)}
+        digests = {
+            f"{path.relative_to(folder)}": digest(path)
+            for path in paths
+            if path.is_relative_to(folder)
+        }
         with writing(folder):
-            append_sums(folder, {name: each for name, each in digests.items() if each not in sums.get(name, ())})
+            append_sums(
+                folder,
+                {name: each for name, each in digests.items() if each not in sums.get(name, ())},
+            )
 
 
 def accompanying(folder: Path) -> dict[str, frozenset[str]]:
     """Return the checksums of the files that accompany the tables: networks, pictures, figures, the report."""
     tabled = (MANIFEST, RUNS, STEPS, FAILURES)
     sums = sums_of(folder) or {}
-    return {name: each for name, each in sums.items() if name not in tabled and not name.startswith(f"{PARTS}/")}
+    return {
+        name: each
+        for name, each in sums.items()
+        if name not in tabled and not name.startswith(f"{PARTS}/")
+    }
 
 
 def unlisted(folder: Path) -> list[str]:
@@ -234,7 +275,11 @@ def unlisted(folder: Path) -> list[str]:
             names.append(f"{(Path(place) / each).relative_to(folder)}/")
             inside.remove(each)
         if Path(place) != folder / PARTS:
-            names += [f"{(Path(place) / each).relative_to(folder)}" for each in files if not PARTIAL.fullmatch(each)]
+            names += [
+                f"{(Path(place) / each).relative_to(folder)}"
+                for each in files
+                if not PARTIAL.fullmatch(each)
+            ]
     return sorted(name for name in names if name not in sums and name not in (SUMS, LOCK))
 
 
@@ -248,7 +293,11 @@ def load_runs(folder: Path) -> pd.DataFrame:
     manifest, names = check_folder(folder), _intact(folder, RUNS)
     runs = tables.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", tables.common_schema(folder, names))
-    empty = {name: float for name, kind in runs.dtypes.items() if name in tables.NUMBERS and kind.kind == "O"}
+    empty = {
+        name: float
+        for name, kind in runs.dtypes.items()
+        if name in tables.NUMBERS and kind.kind == "O"
+    }
     runs = runs.astype(empty) if empty else runs
     period = (manifest.get("changed") or {}).get("run.period")
     if isinstance(period, float):  # of all runs whose period no sweep varies
@@ -265,15 +314,25 @@ def describe_missing(folder: Path) -> str:
     """
     check_folder(folder)
     count = sum(tables.row_count(folder, name) for name in _intact(folder, RUNS))
-    unvouched = f"{SUMS} is missing, so that nothing vouches for the tables" if sums_of(folder) is None else ""
-    return "; ".join(filter(None, (missing_line(count, read_manifest(folder).get("run_count", 0)), unvouched)))
+    unvouched = (
+        f"{SUMS} is missing, so that nothing vouches for the tables"
+        if sums_of(folder) is None
+        else ""
+    )
+    return "; ".join(
+        filter(None, (missing_line(count, read_manifest(folder).get("run_count", 0)), unvouched))
+    )
 
 
 def missing_line(count: int, wanted: int) -> str:
     """Return a line for the user that other than the `wanted` runs are finished; an empty text if these are."""
     if 0 < wanted < count:
         return f"{count} runs are there, and the manifest is of {wanted}: a file of another folder is among them"
-    return f"{count} of {wanted} runs are there: --resume carries out the others" if count < wanted else ""
+    return (
+        f"{count} of {wanted} runs are there: --resume carries out the others"
+        if count < wanted
+        else ""
+    )
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
@@ -283,7 +342,9 @@ def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]
     return tables.row_groups(folder, RUNS, columns)
 
 
-def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collection[str] | None = None) -> pd.DataFrame:
+def load_steps(
+    folder: Path, run_ids: list[str] | None = None, columns: Collection[str] | None = None
+) -> pd.DataFrame:
     """Return the table of steps, of all runs or of those named.
 
     Args:
@@ -299,9 +360,13 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
     names = _intact(folder, STEPS)
     for name in names:
         refuse_lacking(folder / name, "steps", tables.common_schema(folder, [name]))
-    steps = tables.read_tables(folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
+    steps = tables.read_tables(
+        folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns
+    )
     if steps.empty:
-        raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
+        raise ConfigurationError(
+            f"{folder} holds no steps: every run ended before its first period"
+        )
     if "time_s" in steps and not steps["time_s"].between(0.0, tables.MAX_TIME).all():
         raise ConfigurationError(f"{folder} holds steps at no time")
     return steps
@@ -318,7 +383,11 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         if own or path.suffix not in (".parquet", ".csv"):
             continue
         try:
-            table = pd.read_csv(path) if path.suffix == ".csv" else tables.read_tables(folder, [path.name])
+            table = (
+                pd.read_csv(path)
+                if path.suffix == ".csv"
+                else tables.read_tables(folder, [path.name])
+            )
         except (OSError, ValueError, OverflowError) as error:
             why = error.fault if isinstance(error, DamagedFile) else " ".join(str(error).split())
             raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
@@ -381,7 +450,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         why = f"its {MANIFEST} cannot be read" if folder.exists() else "it does not exist"
         there = [] if (folder / MANIFEST).exists() else sorted(folder.glob(f"*/{MANIFEST}"))
         inside = (f"take one that is in it, such as {each.parent}" for each in there)
-        raise ConfigurationError(f"{folder} is not a results folder: {next(inside, why)}") from error
+        raise ConfigurationError(
+            f"{folder} is not a results folder: {next(inside, why)}"
+        ) from error
     version = manifest.get("schema_version") if isinstance(manifest, dict) else None
     if version != SCHEMA_VERSION:
         raise OtherSchema(
@@ -425,7 +496,8 @@ def _text(text: str) -> Callable[[Path], object]:
 
 
 SCHEMA_VERSION = "4"
-CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s [s]"}  # since an earlier schema
+# Since an earlier schema
+CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s [s]"}
 ENTRIES: Final[dict[str, tuple[type, ...]]] = {  # of a manifest: its type, and that of its elements
     "created": (str,), "python": (str,), "platform": (str,), "campaign": (str,), "seeds": (str,), "run_count": (int,),
     "plants": (list, str), "controllers": (list, str), "tasks": (list, str), "mismatches": (list, str),

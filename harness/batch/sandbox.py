@@ -40,7 +40,9 @@ from servobench.plant.contract.faults import ConfigurationError
 
 LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
 START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
-GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
+GUARD_START: Final = (
+    1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
+)
 GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
 
 
@@ -58,14 +60,17 @@ STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
 MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
 MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
-MESSAGE_PAUSE: Final = 10  # [s] without a further byte, after which a message of a runner is given up
+MESSAGE_PAUSE: Final = (
+    10  # [s] without a further byte, after which a message of a runner is given up
+)
 SILENT: Final = "the process of the run reported it as done without its answer"
 TALKATIVE: Final = "the process of the run gave more answers than it had runs"
 KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
 GUARD: Final = "servobench guard"  # name of its process
 ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
 
-Tell: TypeAlias = Callable[[Any], None]  # passes an answer of JSON values up; None is only a sign of life
+# Passes an answer of JSON values up; None is only a sign of life
+Tell: TypeAlias = Callable[[Any], None]
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,9 @@ class Task:
 
     function: Callable[[Any, Tell], None]
     argument: bytes
-    owner: str = ""  # whose code it runs: different owners never share a runner; "" for this package
+    owner: str = (
+        ""  # whose code it runs: different owners never share a runner; "" for this package
+    )
     fresh: bool = False  # needs a runner that has carried nothing out before
     answers: int | None = None  # number of its answers; None for any
 
@@ -103,13 +110,17 @@ class Answer:
 class Workers:
     """A place where tasks are carried out: this process, sandboxes or a cluster."""
 
-    submit: Callable[..., Any] | None = None  # takes a `Task` and returns a future; None: runs stay in this process
+    submit: Callable[..., Any] | None = (
+        None  # takes a `Task` and returns a future; None: runs stay in this process
+    )
     count: int = 1  # number of tasks that are carried out at a time
     cluster: bool = False  # whether runs happen on other machines
     lost: tuple[type[BaseException], ...] = ()  # errors of a future whose process died
 
 
-def call(function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell) -> Ending | None:
+def call(
+    function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell
+) -> Ending | None:
     """Call a function in a sandbox, which is a copy of this process.
 
     Args:
@@ -253,14 +264,24 @@ class Sandbox:
             resource_tracker.ensure_running()  # it ends the block of interrupts below if it starts there
         ours, theirs = context.Pipe()
         inherited = (ours,) if self._copied else ()
-        tracker = getattr(resource_tracker._resource_tracker, "_pid", None)  # Python does not tell it otherwise
-        arguments = (self._modules, __name__, "keep_guard", theirs, self._limits, inherited, tracker)
+        # Python does not tell it otherwise
+        tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
+        arguments = (
+            self._modules,
+            __name__,
+            "keep_guard",
+            theirs,
+            self._limits,
+            inherited,
+            tracker,
+        )
         process: BaseProcess = context.Process(target=processes.begin, name=GUARD, args=arguments)
         with self._lock:
             if self._ended:
                 raise EOFError
             with _interrupts_blocked(), warnings.catch_warnings():  # a process inherits the former
-                warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: threads of libraries, which wait
+                # of Python 3.12: threads of libraries, which wait
+                warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
             self._process = process
         theirs.close()
@@ -300,7 +321,9 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection], tracker: int | None) -> None:
+def keep_guard(
+    link: Connection, limits: Limits, inherited: Sequence[Connection], tracker: int | None
+) -> None:
     """Be a guard: take tasks from a link until it closes.
 
     Args:
@@ -311,11 +334,13 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
     """
     for each in inherited:
         each.close()
-    signal.signal(signal.SIGTERM, lambda *_: link.close())  # no exception, which a destructor would swallow
+    # No exception, which a destructor would swallow
+    signal.signal(signal.SIGTERM, lambda *_: link.close())
     processes.adopt_orphans()
     processes.keep_freed_memory()
     gc.freeze()  # so that runners go on sharing the memory of all imports
-    gc.set_threshold(700)  # of Python 3.11; a copy of the command has a larger one, under which memory piles up
+    # of Python 3.11; a copy of the command has a larger one, under which memory piles up
+    gc.set_threshold(700)
     guard = _Guard(link, limits)
     try:
         link.send_bytes(ALIVE)
@@ -324,7 +349,8 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
         pass
     finally:
         guard.close()
-        processes.send([tracker] if tracker else [], signal.SIGCONT)  # a stopped one does not notice that it is to end
+        # A stopped one does not notice that it is to end
+        processes.send([tracker] if tracker else [], signal.SIGCONT)
 
 
 class _Guard:
@@ -432,7 +458,9 @@ class _Guard:
         """End the runner and all below it."""
         self.end_runner()
         self._trace.seek(0)
-        return End(Ending(status, reason, self._trace.read(4096).decode(errors="replace").strip()), certain)
+        return End(
+            Ending(status, reason, self._trace.read(4096).decode(errors="replace").strip()), certain
+        )
 
     def _is_used_up(self, task: Task) -> bool:
         """Return whether a runner kept something that its next task should not meet."""
@@ -456,7 +484,9 @@ class _Guard:
         processes.end_descendants()
 
 
-def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int, guard: int) -> None:
+def _be_runner(
+    link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int, guard: int
+) -> None:
     """Be a runner: take tasks from the guard until it is gone."""
     processes.lead_session()
     processes.end_with_parent(guard)
@@ -464,7 +494,8 @@ def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits
         each.close()
     processes.forget_tracker()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, lambda *_: None)  # of somebody else; not ignored, which programs started here inherit
+    # of somebody else; not ignored, which programs started here inherit
+    signal.signal(signal.SIGINT, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_SETMASK, set())
     faulthandler.enable(trace, all_threads=False)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)

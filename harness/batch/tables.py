@@ -21,9 +21,12 @@ from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 
-ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
+ROW_GROUP: Final = (
+    2048  # [rows] of a table that are in memory at a time while parts are put together
+)
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
-MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table of any size, and for each byte of its file
+# of a table of any size, and for each byte of its file
+MAX_CELLS, MAX_CELLS_A_BYTE = (2 * 10**7, 100)
 MAX_TIME: Final = 1e9  # [s] of a step, which other formats count in nanoseconds
 NO_THREAD: Final = "launch worker thread"  # in a message of Arrow
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
@@ -58,7 +61,9 @@ def writing(folder: Path) -> Iterator[None]:
         why = error.strerror or str(error) or type(error).__name__
         if error.errno == errno.ENOENT and not folder.is_dir():
             why = "it was removed"
-        raise UnwritableFolder(error.errno, f"results folder {folder} cannot be written: {why}") from error
+        raise UnwritableFolder(
+            error.errno, f"results folder {folder} cannot be written: {why}"
+        ) from error
 
 
 def sums_of(folder: Path) -> Sums | None:
@@ -71,7 +76,9 @@ def sums_of(folder: Path) -> Sums | None:
         return read_sums(folder)
     except OSError as error:
         wrong = f"{folder / SUMS} cannot be read: {error.strerror}"
-        raise ConfigurationError(wrong if folder.is_dir() else f"{folder} is not a results folder") from error
+        raise ConfigurationError(
+            wrong if folder.is_dir() else f"{folder} is not a results folder"
+        ) from error
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
@@ -83,7 +90,9 @@ def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
         numbers = name in NUMBERS or float in map(type, values)
         return made.cast(pa.float64()) if pa.types.is_null(made.type) and numbers else made
 
-    return pa.table({name: column(name) for name in dict.fromkeys(name for row in rows for name in row)})
+    return pa.table(
+        {name: column(name) for name in dict.fromkeys(name for row in rows for name in row)}
+    )
 
 
 def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
@@ -95,7 +104,10 @@ def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
         batch: whose rows these are.
     """
     schema = table.schema.with_metadata({BATCH: batch} if batch else None)
-    with path.open("wb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
+    with (
+        path.open("wb") as file,
+        pq.ParquetWriter(file, schema, write_page_checksum=True) as writer,
+    ):
         if len(table):
             writer.write_table(table.cast(schema))
 
@@ -105,19 +117,29 @@ def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
     schema = common_schema(folder, names).with_metadata({BATCH: batch} if batch else None)
     start, rows = schema.empty_table(), 0
     waiting = [start]
-    with path.open("wb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
+    with (
+        path.open("wb") as file,
+        pq.ParquetWriter(file, schema, write_page_checksum=True) as writer,
+    ):
         for name in names:
-            with opened(folder, name) as part:  # threads and datasets would hold memory that grows with the parts
+            with opened(
+                folder, name
+            ) as part:  # threads and datasets would hold memory that grows with the parts
                 table = part.read(use_threads=False).replace_schema_metadata()
                 waiting.append(pa.concat_tables([start, table], promote_options="permissive"))
             rows += len(table)
             if rows >= ROW_GROUP or (name == names[-1] and rows):
-                writer.write_table(pa.concat_tables(waiting).replace_schema_metadata(schema.metadata))
+                writer.write_table(
+                    pa.concat_tables(waiting).replace_schema_metadata(schema.metadata)
+                )
                 waiting, rows = [start], 0
 
 
 def read_tables(
-    folder: Path, names: Sequence[str], only: ds.Expression | None = None, columns: Collection[str] | None = None
+    folder: Path,
+    names: Sequence[str],
+    only: ds.Expression | None = None,
+    columns: Collection[str] | None = None,
 ) -> pd.DataFrame:
     """Return the rows of tables, one below the other.
 
@@ -135,7 +157,9 @@ def read_tables(
             if only is None:
                 table = file.read(known)
             else:
-                table = pq.read_table(folder / name, columns=known, filters=only, page_checksum_verification=True)
+                table = pq.read_table(
+                    folder / name, columns=known, filters=only, page_checksum_verification=True
+                )
             tables.append(table.replace_schema_metadata())
     with reading(folder, names[-1] if names else ""):
         made: pd.DataFrame = pa.concat_tables(tables, promote_options="permissive").to_pandas()
@@ -147,7 +171,11 @@ def row_groups(folder: Path, name: str, columns: Sequence[str]) -> Iterator[pd.D
     with opened(folder, name) as file:
         known = [each for each in columns if each in file.schema_arrow.names]
         for group in range(file.num_row_groups):
-            yield file.read_row_group(group, known, use_threads=False).replace_schema_metadata().to_pandas()
+            yield (
+                file.read_row_group(group, known, use_threads=False)
+                .replace_schema_metadata()
+                .to_pandas()
+            )
 
 
 def row_count(folder: Path, name: str) -> int:
@@ -180,7 +208,10 @@ def opened(folder: Path, name: str) -> Iterator[pq.ParquetFile]:
     Raises:
         DamagedFile: it cannot be read, unpacks to too much, or has columns of wrong names.
     """
-    with reading(folder, name), pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
+    with (
+        reading(folder, name),
+        pq.ParquetFile(folder / name, page_checksum_verification=True) as file,
+    ):
         names, cells = file.schema_arrow.names, file.metadata.num_rows * file.metadata.num_columns
         if wrong := unfit_names(tuple(names)):
             raise DamagedFile(folder, name, wrong)
@@ -194,7 +225,9 @@ def unfit_names(names: tuple[str, ...]) -> str:
     """Return why names cannot be those of columns, as a predicate of the table; empty if they can."""
     if len(names) > MAX_COLUMNS:
         return f"has {len(names)} columns; a table has at most {MAX_COLUMNS}"
-    fit = len(set(names)) == len(names) and all(each.isprintable() and len(each) <= MAX_NAME for each in names)
+    fit = len(set(names)) == len(names) and all(
+        each.isprintable() and len(each) <= MAX_NAME for each in names
+    )
     return "" if fit else "has two columns of one name, or a name that cannot be printed"
 
 
@@ -226,14 +259,18 @@ TEXTS: Final = frozenset(
      "status", "outcome", "reason", "mismatch_values", "part")
 )  # fmt: skip
 WHOLE: Final = frozenset(("seed", "periods"))
-NUMBERS: Final = frozenset({"settling_band", *WHOLE, *METRICS, *(short.column for short in SHORT_NAMES.values())})
-MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}  # and 0 is the least
+NUMBERS: Final = frozenset(
+    {"settling_band", *WHOLE, *METRICS, *(short.column for short in SHORT_NAMES.values())}
+)
+# And 0 is the least
+MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}
 OWN_STEMS: Final = frozenset(  # names of files and folders that a results folder, or its export, has itself
     ("runs", "steps", "manifest", "failures", "sha256sums", "parts", "pictures", "networks", "figures", "recordings",
      "report", "latest")
 )  # fmt: skip
 MAX_NUMBER: Final = 1e150  # whose square is finite
-RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
+# Also the name of a file: no separator, no ".."
+RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")
 
 
 def lacking(kind: str, schema: pa.Schema) -> str:
@@ -242,7 +279,10 @@ def lacking(kind: str, schema: pa.Schema) -> str:
         return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}"
     for name, given in zip(schema.names, schema.types, strict=True):
         is_text = pa.types.is_string(given) or pa.types.is_large_string(given)
-        is_whole, is_truth = pa.types.is_integer(given), pa.types.is_boolean(given) and name not in NUMBERS
+        is_whole, is_truth = (
+            pa.types.is_integer(given),
+            pa.types.is_boolean(given) and name not in NUMBERS,
+        )
         is_number = is_whole or is_truth or (pa.types.is_floating(given) and name not in WHOLE)
         text, number = name in TEXTS, name in NUMBERS or (kind == "steps" and name != "run_id")
         if not (pa.types.is_null(given) or (is_text and not number) or (is_number and not text)):

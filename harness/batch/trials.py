@@ -86,13 +86,17 @@ def attempt(
                 found[part] = value
 
     limits = processes.Bounds(limit).limits(1, foreign=True)
-    end = sandbox.call(_attempt_here, (function, arguments, quiet, hear is not None), limits, receive)
+    end = sandbox.call(
+        _attempt_here, (function, arguments, quiet, hear is not None), limits, receive
+    )
     if "refusal" in found:
         raise ConfigurationError(str(found["refusal"]))
     return found.get("answer"), str(found.get("failure", "")) if end is None else why(end, limit)
 
 
-def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool, bool], tell: Tell) -> None:
+def _attempt_here(
+    argument: tuple[Callable[..., Any], tuple[object, ...], bool, bool], tell: Tell
+) -> None:
     """Call a function in this process."""
     function, arguments, quiet, heard = argument
     if quiet:
@@ -140,10 +144,15 @@ def try_all(word: Word, robot: str) -> list[Tried]:
     Those of third parties are built once for a robot and thrown away, each in a sandbox.
     """
     registry = REGISTRIES[word]
-    points = {name: point for name in registry.names() if (point := registry.published(name)) is not None}
+    points = {
+        name: point for name in registry.names() if (point := registry.published(name)) is not None
+    }
     if points:
         import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each sandbox
-    return [_try(word, points[name], robot) if name in points else _try_here(word, name) for name in registry.names()]
+    return [
+        _try(word, points[name], robot) if name in points else _try_here(word, name)
+        for name in registry.names()
+    ]
 
 
 def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
@@ -162,7 +171,11 @@ def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
 def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
     """Return the result of a trial; it is built for a robot if there is one."""
     try:
-        entry = find_controller(name) if word == "controller" else installed_plant(name, load=robot is not None)
+        entry = (
+            find_controller(name)
+            if word == "controller"
+            else installed_plant(name, load=robot is not None)
+        )
         if robot is not None:
             from servobench.harness.run.experiment import try_to_build  # noqa: PLC0415 - lists load no runner
 
@@ -211,7 +224,9 @@ def validate(path: Path) -> Validation:
     from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
     from servobench.harness.batch.processes import FOREIGN_TIME  # noqa: PLC0415 - as above
 
-    answer, failure = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False)
+    answer, failure = attempt(
+        _validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False
+    )
     match answer:
         case [list(problems), list(departures), float() | None as deviation]:
             return Validation(tuple(map(str, problems)), tuple(map(str, departures)), deviation)

@@ -13,8 +13,26 @@ from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.controllers.methods import AidedController, with_aids
 from servobench.controllers.servo import Servo, ServoState
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, is_refusal, naming, report
-from servobench.harness.check.rig import PERIOD, PREVIEW, Driver, Rig, Shared, attributes, differing, watching_draws
+from servobench.harness.check.report import (
+    Check,
+    CheckFailed,
+    Finding,
+    Report,
+    at,
+    is_refusal,
+    naming,
+    report,
+)
+from servobench.harness.check.rig import (
+    PERIOD,
+    PREVIEW,
+    Driver,
+    Rig,
+    Shared,
+    attributes,
+    differing,
+    watching_draws,
+)
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.harness.config.settings import default_config, flatten
 from servobench.harness.config.source import describe_at
@@ -32,7 +50,9 @@ APPROACH: Final = 3.0  # [s] after which the error should have become smaller
 OTHER_PERIOD: Final = 0.02  # [s]
 LOSSES: Final = (range(1, 4), range(3), range(10, 20))  # periods in which the feature is lost
 ROUGH: Final = (1e-3, 1e3, 1e6)  # scales of features
-ONE_BY_ONE: Final = "its runs go one by one; those of a Law and an Estimator in a Servo may advance together"
+ONE_BY_ONE: Final = (
+    "its runs go one by one; those of a Law and an Estimator in a Servo may advance together"
+)
 IN_LANES: Final = "its parts must be pure and take arrays with leading axes, see servobench/plant/contract/lanes.py"
 SEED_REMEDY: Final = "make one in reset: self.rng = np.random.default_rng(seed)"
 
@@ -117,7 +137,9 @@ class ControllerChecks:
     def limits(self) -> None:
         """No joint is commanded faster than its limit."""
         driver = self._driver()
-        ratio = np.max(np.abs(driver.begin().run(self.steps)) / driver.rig.spec.joint_velocity_limit)
+        ratio = np.max(
+            np.abs(driver.begin().run(self.steps)) / driver.rig.spec.joint_velocity_limit
+        )
         if ratio > 1.0 + LIMIT_TOLERANCE:
             raise CheckFailed(
                 f"{at(driver.controller.step)}: a command is {ratio:.3g} times the joint-speed limit; shorten it: "
@@ -158,8 +180,13 @@ class ControllerChecks:
         kept = differing(new, attributes(used.begin().controller))
         again = used.run(self.steps)
         if not np.array_equal(first, again):
-            place, name = at(used.controller.reset), f" in self.{', self.'.join(kept)}" if kept else ""
-            raise CheckFailed(f"{place}: reset keeps values of an earlier run{name}; set it anew there")
+            place, name = (
+                at(used.controller.reset),
+                f" in self.{', self.'.join(kept)}" if kept else "",
+            )
+            raise CheckFailed(
+                f"{place}: reset keeps values of an earlier run{name}; set it anew there"
+            )
 
     def separate(self) -> None:
         """Two controllers in one process do not disturb each other."""
@@ -183,7 +210,9 @@ class ControllerChecks:
         try:
             saved = driver.controller.save()
         except Exception as error:  # noqa: BLE001 - of the user's attributes
-            return f"it cannot be saved and continued in several ways: {type(error).__name__}: {error}"
+            return (
+                f"it cannot be saved and continued in several ways: {type(error).__name__}: {error}"
+            )
         plant, rollout = driver.rig.save(), copy(driver.rollout)
         first = driver.run(2)
         driver.controller.restore(saved)
@@ -236,18 +265,28 @@ class ControllerChecks:
         """It brings the feature nearer to its target."""
         for period in (PERIOD, OTHER_PERIOD):
             try:
-                driver = self._driver(period=period, preview=round(PREVIEW * PERIOD / period)).begin()
+                driver = self._driver(
+                    period=period, preview=round(PREVIEW * PERIOD / period)
+                ).begin()
                 before = driver.rig.error()
                 driver.run(1)
             except ValueError as error:
                 if period == PERIOD or not is_refusal(error):
                     raise
                 return f"it does not run with a period of {1e3 * period:g} ms: {' '.join(str(error).split())}"
-            with naming("" if period == PERIOD else f"a period of {1e3 * period:g} ms, knowledge.spec.period"):
+            with naming(
+                ""
+                if period == PERIOD
+                else f"a period of {1e3 * period:g} ms, knowledge.spec.period"
+            ):
                 driver.run(round(APPROACH / period) - 1 if self.steps == STEPS else self.steps)
             after, seconds = driver.rig.error(), driver.rollout.k * period
             if after > before:
-                hint = "; is the error reference[0] - observation.feature?" if after > 1.5 * before else ""
+                hint = (
+                    "; is the error reference[0] - observation.feature?"
+                    if after > 1.5 * before
+                    else ""
+                )
                 grows = f"the error grows from {before:.2g} to {after:.2g} m in {seconds:g} s"
                 return f"on a made-up arm {grows} with a period of {1e3 * period:g} ms{hint}"
         return None
@@ -261,7 +300,11 @@ class ControllerChecks:
                 f"a step takes {1e3 * typical:.0f} ms, longer than {period}: a robot would get its commands too late; "
                 "move work to the constructor, or choose a longer run.period"
             )
-        return f"a step took {1e3 * longest:.0f} ms, longer than {period}" if longest > PERIOD else None
+        return (
+            f"a step took {1e3 * longest:.0f} ms, longer than {period}"
+            if longest > PERIOD
+            else None
+        )
 
     def output(self) -> str | None:
         """It prints nothing."""
@@ -277,7 +320,9 @@ class ControllerChecks:
         if not words.startswith("without"):
             return None if words == "with all aids" else words
         if "aids.delay" in values or not isinstance(getattr(entry.build, "make", None), type):
-            return f"{words}; its settings `aids`, or the argument `aids` of its Servo, switch them on"
+            return (
+                f"{words}; its settings `aids`, or the argument `aids` of its Servo, switch them on"
+            )
         try:
             ControllerChecks(with_aids(entry, EQUIPPED)).command()
         except Exception as error:  # noqa: BLE001 - of the user
@@ -290,14 +335,21 @@ class ControllerChecks:
             return ONE_BY_ONE
         servo, state = getattr(self._build()[0], "servo", None), cast(ServoState | None, None)
         if not isinstance(servo, Servo):
-            raise CheckFailed("its entry says side_by_side=True, so that build must return a ServoController")
+            raise CheckFailed(
+                "its entry says side_by_side=True, so that build must return a ServoController"
+            )
         alone = [self._driver(seed, lost=range(2, 2 + 2 * seed)).begin() for seed in range(2)]
         for _ in range(self.steps):
             given = [(each.rollout.observation, each.rollout.reference) for each in alone]
-            seen, reference = _together([one for one, _ in given]), np.stack([one for _, one in given])
+            seen, reference = (
+                _together([one for one, _ in given]),
+                np.stack([one for _, one in given]),
+            )
             state, u = servo.step(state or servo.start(seen), seen, reference)
             if not np.array_equal(u, np.concatenate([each.run(1) for each in alone])):
-                raise CheckFailed(f"two runs that advance together have other commands than each alone; {IN_LANES}")
+                raise CheckFailed(
+                    f"two runs that advance together have other commands than each alone; {IN_LANES}"
+                )
         return None
 
     def _build(self, period: float = PERIOD, **conditions: Any) -> tuple[Controller, Rig]:  # noqa: ANN401 - `Conditions`
@@ -312,4 +364,6 @@ class ControllerChecks:
 
 def _together(seen: Sequence[Observation]) -> Observation:
     names = "joint_position", "feature", "feature_valid", "valid"
-    return trusted_observation(seen[0].time, *(np.stack([getattr(each, name) for each in seen]) for name in names))
+    return trusted_observation(
+        seen[0].time, *(np.stack([getattr(each, name) for each in seen]) for name in names)
+    )

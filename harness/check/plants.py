@@ -20,14 +20,20 @@ OTHER: Final = "panda", 0.1  # a second robot, and its period [s]
 MISMATCH: Final = "moderate+gear_ratio=5%"
 STEPS: Final = 6
 SHARE: Final = 0.5  # of the joint-speed limits, within which commands are drawn
-MOTION: Final = (0.05, 0.1)  # [rad] by which the first and the last joint are moved, those between by lengths between
-MOTION_TIME, REST_TIME = 0.5, 1.0  # [s] of such a motion, and of the rest after it, longer than usual delays
-TURN: Final = 0.2  # [rad] of the first joint at the start, so that no feature of the two robots is near zero
+# [rad] by which the first and the last joint are moved, those between by lengths between
+MOTION: Final = (0.05, 0.1)
+# [s] of such a motion, and of the rest after it, longer than usual delays
+MOTION_TIME, REST_TIME = (0.5, 1.0)
+TURN: Final = (
+    0.2  # [rad] of the first joint at the start, so that no feature of the two robots is near zero
+)
 START_TOLERANCE: Final = 0.01  # [rad]
 FOLLOWING: Final = (0.6, 1.6)  # a motion over the commanded one
 SAMPLES: Final = 5  # last features at rest, whose median has little noise and no outliers
 FEATURE_TOLERANCE: Final = 0.05  # of the feature, or of its natural size if that is larger
-NOMINAL_SHARE: Final = 0.2  # of the distance from the true model, within which a plant is that of the nominal model
+NOMINAL_SHARE: Final = (
+    0.2  # of the distance from the true model, within which a plant is that of the nominal model
+)
 CLIPPED_STEPS: Final = 4  # more than a usual command delay
 JACOBIAN_STEPS: Final = 4  # of a slow motion that the true Jacobian has to predict
 JACOBIAN_TOLERANCE: Final = 0.05  # of the motion of the feature
@@ -66,8 +72,12 @@ class PlantChecks:
     def __init__(self, entry: PlantEntry) -> None:
         """Prepare the checks."""
         self.entry, self._plants = entry, list[tuple[Plant, PlantSetup]]()
-        self._at_rest: list[tuple[FloatArray, FloatArray, Truth]] = []  # results of `_drive` for each plant
-        self._second = f"a period of {1e3 * OTHER[1]:g} ms" + ("" if entry.own_robot else f" and the robot {OTHER[0]}")
+        self._at_rest: list[
+            tuple[FloatArray, FloatArray, Truth]
+        ] = []  # results of `_drive` for each plant
+        self._second = f"a period of {1e3 * OTHER[1]:g} ms" + (
+            "" if entry.own_robot else f" and the robot {OTHER[0]}"
+        )
 
     @property
     def _plant(self) -> Plant:
@@ -112,7 +122,9 @@ class PlantChecks:
     def repeatable(self) -> None:
         """The same seed gives the same bits."""
         plant, commands = self._plant, self._commands()
-        first, again = ([_bits(plant.reset(7)), *map(_bits, map(plant.step, commands))] for _ in range(2))
+        first, again = (
+            [_bits(plant.reset(7)), *map(_bits, map(plant.step, commands))] for _ in range(2)
+        )
         if first != again:
             raise CheckFailed(
                 "reset with the same seed gives another run: draw all randomness from it and keep nothing"
@@ -127,7 +139,9 @@ class PlantChecks:
                 observation = plant.step(Command(factor * plant.spec.joint_velocity_limit))
             moves.append(observation.joint_position)
         if not np.allclose(moves[0], moves[1], atol=1e-9):
-            raise CheckFailed("a command of ten times the limits moves farther than the limits allow: clip it in step")
+            raise CheckFailed(
+                "a command of ten times the limits moves farther than the limits allow: clip it in step"
+            )
 
     def wrong_size(self) -> None:
         """A command of the wrong size is refused."""
@@ -135,7 +149,9 @@ class PlantChecks:
         plant.reset(0)
         with contextlib.suppress(ValueError):
             plant.step(Command(np.zeros(plant.spec.n + 1)))
-            raise CheckFailed(f"step must refuse {plant.spec.n + 1} joint velocities by a ValueError")
+            raise CheckFailed(
+                f"step must refuse {plant.spec.n + 1} joint velocities by a ValueError"
+            )
 
     def negative_seed(self) -> None:
         """A negative seed is refused."""
@@ -145,7 +161,9 @@ class PlantChecks:
 
     def truth(self) -> str | None:
         """The true feature is what is measured and what the model says, and its Jacobian predicts how it moves."""
-        for (plant, setup), at_rest, what in zip(self._plants, self._at_rest, ("", self._second), strict=False):
+        for (plant, setup), at_rest, what in zip(
+            self._plants, self._at_rest, ("", self._second), strict=False
+        ):
             with naming(what):
                 _compare(plant.spec, setup, *at_rest)
         plant = self._plant
@@ -157,12 +175,16 @@ class PlantChecks:
         if before.jacobian is None or after.jacobian is None:
             return "the plant does not know its true Jacobian, so the error of estimates cannot be logged"
         moved = after.feature - before.feature
-        wrong = np.linalg.norm(moved - (before.jacobian + after.jacobian) / 2 @ (observation.joint_position - start))
+        wrong = np.linalg.norm(
+            moved - (before.jacobian + after.jacobian) / 2 @ (observation.joint_position - start)
+        )
         size = float(np.linalg.norm(moved))
         if size < MIN_MOTION * plant.spec.feature.scale:
             return "the feature hardly moves at the start, so the true Jacobian cannot be judged"
         if not wrong <= JACOBIAN_TOLERANCE * size:
-            raise CheckFailed(f"truth().jacobian misses {wrong / size:.0%} of a small motion of truth().feature")
+            raise CheckFailed(
+                f"truth().jacobian misses {wrong / size:.0%} of a small motion of truth().feature"
+            )
         return None
 
     def save(self) -> str | None:
@@ -176,7 +198,9 @@ class PlantChecks:
         first = [_bits(plant.step(command)) for command in commands]
         plant.restore(state)
         if first != [_bits(plant.step(command)) for command in commands]:
-            raise CheckFailed("after restore the run goes on otherwise: save must return all that step changes")
+            raise CheckFailed(
+                "after restore the run goes on otherwise: save must return all that step changes"
+            )
         return None
 
     def closing(self) -> None:
@@ -194,7 +218,9 @@ class PlantChecks:
         model, _ = sample_mismatch(Mismatch.parse(MISMATCH), robot, 1)
         start = np.array([TURN, *np.zeros(robot.n - 1)]) + robot.workspace.home
         setup = PlantSetup(model, start, period, robot)
-        config = self.entry.config() if self.entry.config_for is None else self.entry.config_for(robot)
+        config = (
+            self.entry.config() if self.entry.config_for is None else self.entry.config_for(robot)
+        )
         return self.entry.build(config, setup), setup
 
     def _commands(self) -> list[Command]:
@@ -204,23 +230,38 @@ class PlantChecks:
 
 
 def _bits(observation: Observation) -> tuple[bytes, bytes, bool]:
-    return observation.joint_position.tobytes(), observation.feature.tobytes(), bool(observation.feature_valid)
+    return (
+        observation.joint_position.tobytes(),
+        observation.feature.tobytes(),
+        bool(observation.feature_valid),
+    )
 
 
 def _drive(plant: Plant, setup: PlantSetup) -> tuple[FloatArray, FloatArray, Truth]:
     """Move all joints, and return joint positions, measured feature and truth at rest after it."""
     spec, period, start = plant.spec, setup.period, setup.start
     if not np.isclose(spec.period, period, rtol=1e-9):
-        raise CheckFailed(f"spec.period must be the period of the setup, {period:g} s, got {spec.period:g} s")
+        raise CheckFailed(
+            f"spec.period must be the period of the setup, {period:g} s, got {spec.period:g} s"
+        )
     if start is not None and spec.n != len(start):
-        raise CheckFailed(f"spec has {spec.n} joints and the start {len(start)}: take their number from setup.robot()")
+        raise CheckFailed(
+            f"spec has {spec.n} joints and the start {len(start)}: take their number from setup.robot()"
+        )
     if setup.model is not None and len(setup.model.channel.names) != spec.m:
-        has, camera = (f"{', '.join(each.names)} in {each.unit}" for each in (spec.feature, setup.model.channel))
+        has, camera = (
+            f"{', '.join(each.names)} in {each.unit}"
+            for each in (spec.feature, setup.model.channel)
+        )
         remedy = "of which controllers get the Jacobian: measure these, or set own_robot = True and bring arm and start"
-        raise CheckFailed(f"spec has the features {has}, and the camera of the setup has {camera}, {remedy}")
+        raise CheckFailed(
+            f"spec has the features {has}, and the camera of the setup has {camera}, {remedy}"
+        )
     first = plant.reset(0).joint_position
     if start is not None and not np.abs(first - start).max() <= START_TOLERANCE:
-        raise CheckFailed(f"reset must begin at setup.start, {start.round(3).tolist()} rad, got {first.tolist()}")
+        raise CheckFailed(
+            f"reset must begin at setup.start, {start.round(3).tolist()} rad, got {first.tolist()}"
+        )
     inwards = np.where(first < (spec.joint_lower + spec.joint_upper) / 2.0, 1.0, -1.0)
     room = np.minimum(MOTION_TIME * spec.joint_velocity_limit, spec.joint_upper - spec.joint_lower)
     wanted = inwards * np.minimum(np.linspace(*MOTION, spec.n), SHARE * room)
@@ -229,7 +270,9 @@ def _drive(plant: Plant, setup: PlantSetup) -> tuple[FloatArray, FloatArray, Tru
     seen = [plant.reset(0), *map(plant.step, commands)]
     for k, observation in enumerate(seen):
         if abs(observation.time - k * period) > 1e-12:
-            raise CheckFailed(f"after {k} steps time must be {k * period:g} s, got {observation.time!r}")
+            raise CheckFailed(
+                f"after {k} steps time must be {k * period:g} s, got {observation.time!r}"
+            )
     joints = seen[-1].joint_position
     least, most = FOLLOWING
     for name, moved, asked in zip(spec.joint_names, joints - first, wanted, strict=True):
@@ -242,18 +285,26 @@ def _drive(plant: Plant, setup: PlantSetup) -> tuple[FloatArray, FloatArray, Tru
     return joints, np.median([each.feature for each in seen[-SAMPLES:]], axis=0), plant.truth()
 
 
-def _compare(spec: PlantSpec, setup: PlantSetup, joints: FloatArray, seen: FloatArray, truth: Truth) -> None:
+def _compare(
+    spec: PlantSpec, setup: PlantSetup, joints: FloatArray, seen: FloatArray, truth: Truth
+) -> None:
     """Hold the true feature at rest against the measured one and that of the robot that the plant was given."""
     unit, true = spec.feature_unit, truth.feature
     tolerance = FEATURE_TOLERANCE * max(spec.feature.scale, float(np.linalg.norm(true)))
     said = f"at rest truth().feature is {true.round(4).tolist()} {unit}"
     if not np.linalg.norm(seen - true) <= tolerance:
         remedy = "both are of one camera, in one order and unit"
-        raise CheckFailed(f"{said}, and the measured feature {seen.round(4).tolist()} {unit}; {remedy}")
+        raise CheckFailed(
+            f"{said}, and the measured feature {seen.round(4).tolist()} {unit}; {remedy}"
+        )
     if setup.model is None or setup.nominal is None:
         return
     model, nominal = (each.feature(joints) for each in (setup.model, setup.nominal.nominal))
     wrong = np.linalg.norm(true - model)
     if wrong > tolerance or np.linalg.norm(true - nominal) < NOMINAL_SHARE * wrong:
-        remedy = "the plant has to be the robot and camera that setup.robot() returns, mismatch included"
-        raise CheckFailed(f"{said}, and that of setup.model {model.round(4).tolist()} {unit}; {remedy}")
+        remedy = (
+            "the plant has to be the robot and camera that setup.robot() returns, mismatch included"
+        )
+        raise CheckFailed(
+            f"{said}, and that of setup.model {model.round(4).tolist()} {unit}; {remedy}"
+        )

@@ -88,7 +88,10 @@ class Check(NamedTuple):
 
 
 def report(
-    subject: str, checks: Iterable[Check], begin: Callable[[str], None], found: Callable[[Finding], None]
+    subject: str,
+    checks: Iterable[Check],
+    begin: Callable[[str], None],
+    found: Callable[[Finding], None],
 ) -> Report:
     """Carry out checks one after the other and return their findings.
 

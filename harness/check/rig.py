@@ -64,8 +64,12 @@ class Rig(Plant):
         self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
         self.places = rng.uniform(-0.5, 0.5, (2, 2, n))  # start and goal [rad] of each seed
         self.start, self.goal = self.places[0]
-        joints, features = (tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("q", n), ("y", m)))
-        self.spec = PlantSpec.of_joints(joints, features, np.full(n, 1.0), np.full(n, -6.0), np.full(n, 6.0), period)
+        joints, features = (
+            tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("q", n), ("y", m))
+        )
+        self.spec = PlantSpec.of_joints(
+            joints, features, np.full(n, 1.0), np.full(n, -6.0), np.full(n, 6.0), period
+        )
 
     def feature(self, q: FloatArray) -> FloatArray:
         """Return the true feature (..., m) [m] at joint positions (..., n) [rad]."""
@@ -84,10 +88,14 @@ class Rig(Plant):
         """Return the knowledge of a controller; with `truth` also that of an upper bound."""
         side, delays = np.ones(self.spec.n), Delays(0.0, 0.0, 0.0)
         preview, region = self.conditions.preview, (-side, side)
-        known = RobotKnowledge(self.spec, preview, self.model_jacobian, region=region, train=self._train)
+        known = RobotKnowledge(
+            self.spec, preview, self.model_jacobian, region=region, train=self._train
+        )
         if not truth:
             return known
-        return replace(known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=delays)
+        return replace(
+            known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=delays
+        )
 
     def reset(self, seed: int) -> Observation:
         """See `Plant.reset`; the arm stands at its start, or at its goal."""
@@ -109,7 +117,9 @@ class Rig(Plant):
         if self.conditions.at_goal:
             return Observation(time, self.q, feature)
         noisy = feature + self._rng.normal(scale=NOISE, size=self.spec.m)
-        return Observation(time, self.q, self.conditions.scale * noisy, self._k not in self.conditions.lost)
+        return Observation(
+            time, self.q, self.conditions.scale * noisy, self._k not in self.conditions.lost
+        )
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
@@ -149,7 +159,9 @@ class Driver:
         """Reset the controller."""
         conditions, rig = self.rig.conditions, self.rig
         rig.start, rig.goal = rig.places[self.seed % len(rig.places)]
-        desired = conditions.scale * np.tile(rig.feature(rig.goal), (MAX_PERIODS + conditions.preview, 1))
+        desired = conditions.scale * np.tile(
+            rig.feature(rig.goal), (MAX_PERIODS + conditions.preview, 1)
+        )
         desired.flags.writeable = False
         length = LoopSettings(MAX_PERIODS, conditions.preview)
         self.rollout = begin(rig, self._held, desired, length, (self.seed, self.seed))
@@ -190,12 +202,17 @@ def watching_draws() -> Iterator[list[str]]:
     finally:
         source.randbits = original
         shared = [name for name, state in _states().items() if state != before[name]]
-        found += [f"it draws from the generator of {name}, which no seed of a run sets" for name in shared]
+        found += [
+            f"it draws from the generator of {name}, which no seed of a run sets" for name in shared
+        ]
 
 
 def _states() -> dict[str, object]:
     shared: Any = np.random.get_state(legacy=False)  # noqa: NPY002 - it is compared, not used
-    return {"numpy.random": (shared["state"]["key"].tobytes(), shared["state"]["pos"]), "random": random.getstate()}
+    return {
+        "numpy.random": (shared["state"]["key"].tobytes(), shared["state"]["pos"]),
+        "random": random.getstate(),
+    }
 
 
 def attributes(thing: object) -> dict[str, Any]:
@@ -204,7 +221,11 @@ def attributes(thing: object) -> dict[str, Any]:
     found = {}
     for name, value in vars(thing).items():
         with contextlib.suppress(Exception):  # objects in a list that cannot be copied
-            if isinstance(value, plain) and not name.startswith("__") and _same(copy := deepcopy(value), value):
+            if (
+                isinstance(value, plain)
+                and not name.startswith("__")
+                and _same(copy := deepcopy(value), value)
+            ):
                 found[name] = copy
     return found
 
@@ -229,8 +250,14 @@ class Shared:
     def __init__(self, kind: type) -> None:
         """Keep their values."""
         modules = {each.__module__: sys.modules.get(each.__module__) for each in kind.__mro__}
-        users = {name: each for name, each in modules.items() if is_users(getattr(each, "__file__", None) or "<")}
-        self._owners = users | {each.__name__: each for each in kind.__mro__ if each.__module__ in users}
+        users = {
+            name: each
+            for name, each in modules.items()
+            if is_users(getattr(each, "__file__", None) or "<")
+        }
+        self._owners = users | {
+            each.__name__: each for each in kind.__mro__ if each.__module__ in users
+        }
         self._before = {name: attributes(each) for name, each in self._owners.items()}
         self._known = {name: {*vars(each)} for name, each in self._owners.items()}
 

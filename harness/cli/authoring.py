@@ -37,7 +37,9 @@ NEXT: Final = {  # kind of a new file -> the next commands
     "plant": ("check plant {}", "run --plant {}"),
 }
 COLOURS: Final = {"ok": "green", "failed": "bold red", "note": "yellow"}
-LOG = typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
+LOG = typer.Argument(
+    help="Results folder, or a table (.csv, .parquet) with the columns of its steps."
+)
 LEGEND: Final = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
     "The log does not answer to the controller, so that this does not say how well it would have done."
@@ -46,9 +48,13 @@ LEGEND: Final = (
 
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
-    name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")] = "",
+    name: Annotated[
+        str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")
+    ] = "",
     folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
-    aids: Annotated[bool, switch("--aids", "A controller with the aids of the bench's methods.")] = False,
+    aids: Annotated[
+        bool, switch("--aids", "A controller with the aids of the bench's methods.")
+    ] = False,
 ) -> None:
     """Write a commented controller or plant, and its test."""
     from importlib.metadata import packages_distributions
@@ -57,34 +63,54 @@ def new(
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
         raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is {commands}")
     if aids and kind != "controller":
-        raise ConfigurationError(f"--aids are those of a controller; leave the option out for a {kind}")
+        raise ConfigurationError(
+            f"--aids are those of a controller; leave the option out for a {kind}"
+        )
     module = name.removesuffix(".py")
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", module) or keyword.iskeyword(module) or module.startswith(PREFIX):
-        raise ConfigurationError(f"the name must be one of a Python module, such as my_law, got {name!r}")
+    if (
+        not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", module)
+        or keyword.iskeyword(module)
+        or module.startswith(PREFIX)
+    ):
+        raise ConfigurationError(
+            f"the name must be one of a Python module, such as my_law, got {name!r}"
+        )
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
     templates = "aided_controller" if aids else kind, f"{PREFIX}{kind}"
-    wanted = dict(zip((folder / f"{module}.py", folder / f"{PREFIX}{module}.py"), templates, strict=True))
+    wanted = dict(
+        zip((folder / f"{module}.py", folder / f"{PREFIX}{module}.py"), templates, strict=True)
+    )
     for path in wanted:
         if path.exists():
-            raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
+            raise ConfigurationError(
+                f"{path} exists already and is left as it is; take another name or --folder"
+            )
     if module in sys.stdlib_module_names or module in packages_distributions():
         hidden = f"a Python package is called {module}, which a file of this name would hide"
         raise ConfigurationError(f"{hidden}; take another")
     with accessing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():
-            text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(encoding="utf-8")
+            text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(
+                encoding="utf-8"
+            )
             text = text.replace("{{module}}", module).replace("{{Class}}", class_name)
             write_atomically(path, partial(Path.write_text, data=text, encoding="utf-8"))
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
-    lines = [f"wrote {file} and {test}; next:", *(f"    servobench {command.format(place)}" for command in NEXT[kind])]
+    lines = [
+        f"wrote {file} and {test}; next:",
+        *(f"    servobench {command.format(place)}" for command in NEXT[kind]),
+    ]
     say("\n".join(lines))
 
 
 def check(
     subject: Annotated[
-        list[str], typer.Argument(metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic.")
+        list[str],
+        typer.Argument(
+            metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic."
+        ),
     ],
     limit: Annotated[float, option("SECONDS", "Time limit of one check [s].", min=1.0)] = 60.0,
 ) -> None:
@@ -100,10 +126,14 @@ def check(
     from servobench.harness.check.report import Finding
 
     if subject == ["plant"]:
-        raise ConfigurationError("check plant needs a plant, such as servobench check plant ./cell.py")
+        raise ConfigurationError(
+            "check plant needs a plant, such as servobench check plant ./cell.py"
+        )
     is_plant, name = subject[0] == "plant", subject[-1]
     if len(subject) != 1 + is_plant:
-        raise ConfigurationError(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
+        raise ConfigurationError(
+            f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}"
+        )
     checks: Checks = check_plant if is_plant else check_controller
     findings: list[Finding] = []
 
@@ -114,7 +144,10 @@ def check(
 
     run_checks(checks, name, limit, hear)
     failed = sum(finding.verdict == "failed" for finding in findings)
-    say(f"{name}: " + (f"{failed} of {len(findings)} checks failed" if failed else "keeps its contract"))
+    say(
+        f"{name}: "
+        + (f"{failed} of {len(findings)} checks failed" if failed else "keeps its contract")
+    )
     if failed:
         sys.exit(FAILED)
 
@@ -127,7 +160,9 @@ def shadow(
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    out: Annotated[Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")] = None,
+    out: Annotated[
+        Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")
+    ] = None,
 ) -> None:
     """Compare commands and predictions of a controller with a log.
 
@@ -139,7 +174,9 @@ def shadow(
 
     chosen = None if controller is None else selection.choose("controllers", controller)
     if chosen is not None and find_controller(chosen).needs_truth and not log.is_dir():
-        raise ConfigurationError(f"controller {chosen} is given the true robot, which {log} does not have")
+        raise ConfigurationError(
+            f"controller {chosen} is given the true robot, which {log} does not have"
+        )
     resolved, table = _logged(log, run, chosen, (robot, sensing), out)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
@@ -149,12 +186,19 @@ def shadow(
             write_csv(seen, out)
         say(f"table in {out}")
     elif apart.empty and ahead.empty:
-        raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
+        raise ConfigurationError(
+            f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller"
+        )
     if ahead.empty:
         say(f"{name} gives no Jacobian that could predict a feature")
     titles = f"{name} beside the log", f"Features one frame ahead, by the Jacobian of {name}"
-    tables = [(title, rows) for title, rows in zip(titles, (apart, ahead), strict=True) if not rows.empty]
-    words = [(title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}")) for title, rows in tables]
+    tables = [
+        (title, rows) for title, rows in zip(titles, (apart, ahead), strict=True) if not rows.empty
+    ]
+    words = [
+        (title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}"))
+        for title, rows in tables
+    ]
     print_tables(words, LEGEND)
 
 
@@ -163,7 +207,9 @@ def identify(
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    out: Annotated[Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")] = None,
+    out: Annotated[
+        Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")
+    ] = None,
 ) -> None:
     """Identify arm, camera and drive from a log, as a twin.
 
@@ -187,27 +233,39 @@ def identify(
     setup, own = find_sensing(request.sensing), find_robot(request.robot)
     if own.twin:
         wanted = f"identify a table, such as steps.parquet, with --robot {own.twin.keys.robot}"
-        raise ConfigurationError(f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}")
-    if not log.is_dir():  # a table does not say at which speed commands are clipped: at that of the robot
-        resolved = replace(resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max())))
+        raise ConfigurationError(
+            f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}"
+        )
+    if (
+        not log.is_dir()
+    ):  # a table does not say at which speed commands are clipped: at that of the robot
+        resolved = replace(
+            resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
+        )
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)
     experiment.plant.close()
     apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
-        mistake, found = mistakes(rows, setup.nominal(own), lambda: {k: setup.nominal(find_robot(k)) for k in apart})
+        mistake, found = mistakes(
+            rows, setup.nominal(own), lambda: {k: setup.nominal(find_robot(k)) for k in apart}
+        )
         response = command_response(rows)
     if found is None:
         say(f"{log}: {mistake}")
         sys.exit(FAILED)
-    print_tables([(f"{log} against the nominal {own.title}, where they differ", estimates(found, response))])
+    print_tables(
+        [(f"{log} against the nominal {own.title}, where they differ", estimates(found, response))]
+    )
     say("\n".join(remarks(rows, found, response)))
     if out is not None:
         with accessing(out):
             folder = out.resolve().parent  # where the twin looks for files first
             named = with_files(
                 request.robot,
-                lambda file: os.path.relpath(user_path(file), folder) if user_path(file).is_file() else file,
+                lambda file: (
+                    os.path.relpath(user_path(file), folder) if user_path(file).is_file() else file
+                ),
             )
             text = twin_text(found, rows, response, (named, request.sensing))
             write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
@@ -240,12 +298,16 @@ def _logged(
         resolved, table = logged_in_folder(log, run, controller, named[1])
         for word, given, usual in (("robot", named[0], "ur5"), ("sensing", named[1], "position")):
             if given not in (usual, own := getattr(resolved.request, word)):
-                raise ConfigurationError(f"--{word} {given} is not that of the run, {own}; leave it out for a folder")
+                raise ConfigurationError(
+                    f"--{word} {given} is not that of the run, {own}; leave it out for a folder"
+                )
         return resolved, table
     if run is not None:
         raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
     if controller is None:
-        raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
+        raise ConfigurationError(
+            f"{log} does not say which controller to show it to; name one with --controller"
+        )
     return logged_in_file(log, controller, *named)
 
 
@@ -258,8 +320,12 @@ def serve(
     sensing: options.SensingOption = "position",
     seed: Annotated[int, option("INTEGER", "Seed of the plant.")] = 0,
     overrides: options.Overrides,
-    address: Annotated[str, option("ADDRESS", "Of the network interface to listen on.")] = "127.0.0.1",
-    lockstep: Annotated[bool, switch("--lockstep", "Let the clock wait for the command of each period.")] = False,
+    address: Annotated[
+        str, option("ADDRESS", "Of the network interface to listen on.")
+    ] = "127.0.0.1",
+    lockstep: Annotated[
+        bool, switch("--lockstep", "Let the clock wait for the command of each period.")
+    ] = False,
 ) -> None:
     """Serve a plant on the ports of a UR.
 

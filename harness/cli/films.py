@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Value, named_option, option
+from servobench.harness.cli.options import (
+    CONTROLLER,
+    MISMATCH,
+    PLANT,
+    ROBOT,
+    TASK,
+    Value,
+    named_option,
+    option,
+)
 from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import writing_together
@@ -19,7 +28,13 @@ from servobench.plant.contract.files import writing_together
 if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
 
-RECORDED = {"controller": "rbfnn_mfac", "task": "circle", "mismatch": "moderate", "robot": "ur5", "seed": 0}
+RECORDED = {
+    "controller": "rbfnn_mfac",
+    "task": "circle",
+    "mismatch": "moderate",
+    "robot": "ur5",
+    "seed": 0,
+}
 RECORDINGS = "recordings"
 
 
@@ -31,34 +46,44 @@ def _new(name: str, value: Value | str) -> Any:  # noqa: ANN401 - typer's own wo
 class NewRun:
     """The run that is carried out where no folder is given."""
 
-    plant: Annotated[str | None, option(PLANT, "New run: plant, default bullet, or mujoco without PyBullet.")] = None
+    plant: Annotated[
+        str | None, option(PLANT, "New run: plant, default bullet, or mujoco without PyBullet.")
+    ] = None
     controller: Annotated[str | None, _new("controller", CONTROLLER)] = None
     task: Annotated[str | None, _new("task", TASK)] = None
     mismatch: Annotated[str | None, _new("mismatch", MISMATCH)] = None
     robot: Annotated[str | None, _new("robot", ROBOT)] = None
     seed: Annotated[int | None, _new("seed", "INTEGER")] = None
     set_: Annotated[
-        list[str] | None, named_option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
+        list[str] | None,
+        named_option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05."),
     ] = None
     config: Annotated[Path | None, option("FILE", "New run: TOML file with settings.")] = None
 
 
 def record(
     folder: Annotated[
-        Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
+        Path | None,
+        typer.Argument(help="Results folder whose run to show; without one a run is carried out."),
     ] = None,
     *,
     run: options.RunIdOption = None,
     new: NewRun,
-    kinds: Annotated[str, option("NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
-    begin: Annotated[float, option("SECONDS", "Time in the run at which the film begins [s].", min=0.0)] = 0.0,
+    kinds: Annotated[
+        str, option("NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")
+    ] = "all",
+    begin: Annotated[
+        float, option("SECONDS", "Time in the run at which the film begins [s].", min=0.0)
+    ] = 0.0,
     length: Annotated[
-        float | None, option("SECONDS", "Length of the film [s]; default: to the end of the run.", min=0.001)
+        float | None,
+        option("SECONDS", "Length of the film [s]; default: to the end of the run.", min=0.001),
     ] = None,
     out: Annotated[
         Path | None,
         option(
-            "PATH", "Folder for the films, or the file of one film (.mp4, .gif); default: recordings in the folder."
+            "PATH",
+            "Folder for the films, or the file of one film (.mp4, .gif); default: recordings in the folder.",
         ),
     ] = None,
 ) -> None:
@@ -73,10 +98,16 @@ def record(
 
     film = out if out is not None and out.suffix.removeprefix(".") in (MP4, GIF) else None
     if film is None and out is not None and out.suffix[1:].isalpha() and not out.is_dir():
-        raise ConfigurationError(f"--out {out} must be a folder, or one film that ends in .{MP4} or .{GIF}")
+        raise ConfigurationError(
+            f"--out {out} must be a folder, or one film that ends in .{MP4} or .{GIF}"
+        )
     if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
-        raise ConfigurationError(f"--out {film} names one film; leave --kinds {kinds} away, or name a folder")
-    wanted = selection.split_names("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS)
+        raise ConfigurationError(
+            f"--out {film} names one film; leave --kinds {kinds} away, or name a folder"
+        )
+    wanted = selection.split_names(
+        "kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS
+    )
     into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
     with telling(console, "reading" if folder else "running") as tell:
@@ -115,12 +146,17 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     if folder is not None:
         if given:
             name = next(iter(given)).rstrip("_")
-            raise ConfigurationError(f"--{name} belongs to a new run; a run of {folder} is named by --run")
+            raise ConfigurationError(
+                f"--{name} belongs to a new run; a run of {folder} is named by --run"
+            )
         row = find_run(folder, run_id)
         return logged_run(row, results.load_steps(folder, [row["run_id"]]))
     if run_id is not None:
         raise ConfigurationError("--run names a run of a results folder, and no folder is given")
-    names = {name: given.get(name, usual) for name, usual in {"plant": rendered_plant(new.plant), **RECORDED}.items()}
+    names = {
+        name: given.get(name, usual)
+        for name, usual in {"plant": rendered_plant(new.plant), **RECORDED}.items()
+    }
     settings = read_settings(new.config, new.set_ or [])
     chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
     request = RunRequest(**names | chosen | {"mismatch": read_mismatch(names["mismatch"])})

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
 
-fmu_app = typer.Typer(help="Export an arm or a controller as an FMU; check and show FMUs.", no_args_is_help=True)
+fmu_app = typer.Typer(
+    help="Export an arm or a controller as an FMU; check and show FMUs.", no_args_is_help=True
+)
 
 FileArgument = Annotated[Path, typer.Argument(dir_okay=False, help="The .fmu file.")]
 
@@ -36,7 +38,10 @@ class Export:
     seed: Annotated[int, option("INTEGER", "Seed of the run whose robot this is.")] = 0
     platforms: Annotated[
         str | None,
-        option("NAMES", "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
+        option(
+            "NAMES",
+            "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine.",
+        ),
     ] = None
 
     @contextlib.contextmanager
@@ -52,7 +57,9 @@ class Export:
 
         names = "kinematic", selection.choose("controllers", controller), "target"
         check_settings(settings, names)
-        return RunRequest(*names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing)
+        return RunRequest(
+            *names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing
+        )
 
 
 def check_output(output: Path, ending: str) -> None:
@@ -67,7 +74,9 @@ def check_output(output: Path, ending: str) -> None:
 @command
 def export(
     *,
-    output: Annotated[Path, named_option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)],
+    output: Annotated[
+        Path, named_option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)
+    ],
     fmi: Annotated[
         int,
         option(
@@ -89,12 +98,18 @@ def export(
     if controller is None and settings.sections:
         raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
     if controller is not None and (exported.mismatch != "none" or exported.seed):
-        raise ConfigurationError("--mismatch and --seed are for an arm; a controller does not know them")
+        raise ConfigurationError(
+            "--mismatch and --seed are for an arm; a controller does not know them"
+        )
     check_output(output, ".fmu")
     with exported.compiling() as platforms:
         request = exported.request(controller or "constant", settings)
         if controller is None:
-            words = "none" if exported.mismatch == "none" else f"{exported.mismatch}, seed {exported.seed}"
+            words = (
+                "none"
+                if exported.mismatch == "none"
+                else f"{exported.mismatch}, seed {exported.seed}"
+            )
             product = arm_product(request, words, fmi)
         else:
             check_version(fmi)
@@ -108,7 +123,9 @@ def export(
 @command
 def ssp(
     *,
-    output: Annotated[Path, named_option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)],
+    output: Annotated[
+        Path, named_option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)
+    ],
     controller: Annotated[str, option(CONTROLLER, "Name or file of the controller.")],
     exported: Export,
     overrides: options.Overrides,
@@ -146,7 +163,10 @@ def validate(file: FileArgument) -> None:
     for departure in found.departures:
         say(f"breaks the standard here{ran}: {departure}")
     if found.deviation is None:
-        say("no reference run inside" + ("" if found.problems else "; it was loaded and made ready for a run"))
+        say(
+            "no reference run inside"
+            + ("" if found.problems else "; it was loaded and made ready for a run")
+        )
     else:
         say(f"reference run: largest difference {found.deviation:.2g}")
     if found.problems:

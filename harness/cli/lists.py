@@ -25,7 +25,9 @@ HELP = "Name whose settings to show."
 
 
 def plants(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.PLANT.complete)] = None,
+    name: Annotated[
+        str | None, typer.Argument(help=HELP, autocompletion=options.PLANT.complete)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
@@ -33,7 +35,9 @@ def plants(
 
 
 def controllers(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.CONTROLLER.complete)] = None,
+    name: Annotated[
+        str | None, typer.Argument(help=HELP, autocompletion=options.CONTROLLER.complete)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
@@ -41,13 +45,21 @@ def controllers(
 
     _list_or_show("controller", name, as_json=as_json)
     if not (name or as_json):
-        console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
-        console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
+        console.print(
+            "\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:"
+        )
+        console.print(
+            f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False
+        )
 
 
 def tasks(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.TASK.complete)] = None,
-    robot: Annotated[str, options.option(options.ROBOT._replace(check=None), options.ROBOT_WORDS)] = DEFAULT_ROBOT,
+    name: Annotated[
+        str | None, typer.Argument(help=HELP, autocompletion=options.TASK.complete)
+    ] = None,
+    robot: Annotated[
+        str, options.option(options.ROBOT._replace(check=None), options.ROBOT_WORDS)
+    ] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
@@ -58,22 +70,32 @@ def tasks(
         name = choose_task(name)
         _show_settings(name, fitted(name, find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
-        raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
+        raise ConfigurationError(
+            "--robot shows the settings of one task for that arm; name the task, such as exp1"
+        )
     else:
-        _show_names([_described(name, find_task(name).summary) for name in task_names()], as_json=as_json)
+        _show_names(
+            [_described(name, find_task(name).summary) for name in task_names()], as_json=as_json
+        )
 
 
 def sensing(as_json: JsonOption = False) -> None:
     """List the sensing set-ups: features that cameras measure."""
     from servobench.plant.cameras.registry import SETUPS
 
-    _show_names([_described(name, entry.summary) for name, entry in SETUPS.items()], as_json=as_json)
+    _show_names(
+        [_described(name, entry.summary) for name, entry in SETUPS.items()], as_json=as_json
+    )
     if not as_json:
-        console.print("\nEach with fixed cameras or with cameras on the hand, as pixel:hand; or a file of your own.")
+        console.print(
+            "\nEach with fixed cameras or with cameras on the hand, as pixel:hand; or a file of your own."
+        )
 
 
 def init(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The new file; - prints it.")] = Path("bench.toml"),
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The new file; - prints it.")] = Path(
+        "bench.toml"
+    ),
     *,
     plants: options.PlantsOption = "kinematic,bullet",
     controllers: options.ControllersOption = "ukf_mfac",
@@ -94,14 +116,22 @@ def init(
 
     split = selection.split
     names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
-    requests = [RunRequest(*each, read_mismatch("none"), 0, robot=robot) for each in product(*names)]
+    requests = [
+        RunRequest(*each, read_mismatch("none"), 0, robot=robot) for each in product(*names)
+    ]
     settings = overrides.settings()
     check_settings(settings, chain.from_iterable(names))
-    finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}
+    finds: dict[str, Callable[[str], Any]] = {
+        "plant": find_plant,
+        "controller": find_controller,
+        "task": find_task,
+    }
     titles = {"run": "common to all plants, controllers and tasks"}
     for (kind, find), each in zip(finds.items(), names, strict=True):
         titles |= {name: f"{kind}: {find(name).summary}" for name in each}
-    sections, defaults = (resolve_sections(requests, each, to_run=False) for each in (settings, Settings()))
+    sections, defaults = (
+        resolve_sections(requests, each, to_run=False) for each in (settings, Settings())
+    )
     shown = "FILE" if file == STANDARD_OUTPUT else file.name
     text = configuration_file(sections, defaults, titles, f"run --config {shown}")
     if file == STANDARD_OUTPUT:
@@ -127,13 +157,20 @@ def _list_or_show(word: Word, name: str | None, *, as_json: bool) -> None:
     registry = REGISTRIES[word]
     if name:
         entry = registry.find(name := choose(word, name))
-        _show_settings(name, entry.config() if word == "plant" else default_config(entry), as_json=as_json)
+        _show_settings(
+            name, entry.config() if word == "plant" else default_config(entry), as_json=as_json
+        )
         return
     found = [
-        {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
+        {"name": each.name, "error": each.fault}
+        if each.fault
+        else _described(each.name, each.summary)
         for each in try_all(word, DEFAULT_ROBOT)
     ]
-    _show_names(found + [{"name": name, "error": line} for name, line in registry.unused_points()], as_json=as_json)
+    _show_names(
+        found + [{"name": name, "error": line} for name, line in registry.unused_points()],
+        as_json=as_json,
+    )
 
 
 def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:
@@ -153,7 +190,9 @@ def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:
         words = each.get("summary", "")
         if base and words != base:  # a variant: only the difference
             words = words.removeprefix(base).lstrip("; ")
-        table.add_row(Text(each["name"]), Text(words) if words else Text(each.get("error", ""), style="red"))
+        table.add_row(
+            Text(each["name"]), Text(words) if words else Text(each.get("error", ""), style="red")
+        )
     console.print(table)
 
 
@@ -175,7 +214,9 @@ def _show_settings(section: str, config: object, *, as_json: bool) -> None:
     if not found:
         say(f"{section} has no settings")
     for each in found:
-        line = Text(f"{section}.{each.key}", style="bold").append(f" = {toml(each.value) or 'unset'}", style="not bold")
+        line = Text(f"{section}.{each.key}", style="bold").append(
+            f" = {toml(each.value) or 'unset'}", style="not bold"
+        )
         console.print(line, soft_wrap=True)
         unit = f"[{each.unit}] " if each.unit else ""
         words = f"{unit}{each.meaning.rstrip('.')}{f' ({each.allowed})' if each.allowed else ''}"

@@ -26,19 +26,47 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.E
         errno.ENAMETOOLONG)  # fmt: skip
 NO_THREAD: Final = "can't start new thread"  # message of Python
 HELP_NAMES: Final = ["-h", "--help"]
-PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))  # and the reverse
-COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
+# And the reverse
+PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))
+COMPLETION_REQUEST: Final = (
+    "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
+)
 BASH: Final = "complete_bash"
-WORD_BREAKS: Final = frozenset(":=")  # at which bash splits a word, though names of methods and settings have them
-PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
-    "First steps": (runs.run, runs.compare, results.statistics, results.report, results.figures, record),
-    "Your own controller": (authoring.new, authoring.check, authoring.shadow, authoring.identify, authoring.serve),
+# At which bash splits a word, though names of methods and settings have them
+WORD_BREAKS: Final = frozenset(":=")
+PANELS: dict[
+    str, tuple[Callable[..., None], ...]
+] = {  # title -> commands, in the order of first use
+    "First steps": (
+        runs.run,
+        runs.compare,
+        results.statistics,
+        results.report,
+        results.figures,
+        record,
+    ),
+    "Your own controller": (
+        authoring.new,
+        authoring.check,
+        authoring.shadow,
+        authoring.identify,
+        authoring.serve,
+    ),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
-    "Studies": (studies.sweep, studies.analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
+    "Studies": (
+        studies.sweep,
+        studies.analyse,
+        studies.robustness,
+        studies.suite,
+        studies.claims,
+        studies.tune,
+    ),
     "Tools": (runs.train, results.collect, runs.merge, results.export, results.verify),
 }
 
-app = typer.Typer(context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False)
+app = typer.Typer(
+    context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False
+)
 for title, functions in PANELS.items():
     for function in functions:
         app.command(rich_help_panel=title)(command(function))
@@ -56,7 +84,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def servobench(
     _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print version and commit.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print version and commit."
+        ),
     ] = False,
 ) -> None:
     """Compare uncalibrated visual-servoing controllers: servobench COMMAND --help says more."""
@@ -64,7 +95,11 @@ def servobench(
 
 def command_line(called: str = "") -> Any:  # noqa: ANN401 - typer's own classes have no public name
     """Return the command with all subcommands, or with that which is called: typer takes long to build them all."""
-    only = [each for each in app.registered_commands if each.callback and each.callback.__name__ == called]
+    only = [
+        each
+        for each in app.registered_commands
+        if each.callback and each.callback.__name__ == called
+    ]
     part = typer.Typer(context_settings=app.info.context_settings, pretty_exceptions_enable=False)
     part.registered_commands, part.registered_callback = only, app.registered_callback
     root = typer.main.get_command(part if only else app)
@@ -98,7 +133,12 @@ def in_known_number(root: Any, words: list[str]) -> list[str]:  # noqa: ANN401 -
     for k, word in enumerate(words):
         option, equals, value = word.partition("=")
         others = [option.removesuffix(old) + new for old, new in PLURALS if option.endswith(old)]
-        if not option.startswith("--") or option in known or (name, option) in ABSENT or not known.intersection(others):
+        if (
+            not option.startswith("--")
+            or option in known
+            or (name, option) in ABSENT
+            or not known.intersection(others)
+        ):
             continue
         other = next(each for each in others if each in known)
         words = [*words[:k], other + equals + value, *words[k + 1 :]]
@@ -122,12 +162,17 @@ def _carry_out(caught: list[int]) -> None:
     """Run the command line; `caught` gets the signals that end it."""
     if sys.__stderr__ is not None:
         with contextlib.suppress(OSError, ValueError):  # it may be closed, or no file
-            faulthandler.enable(sys.__stderr__)  # a segmentation fault, as of a plug-in, prints the line that it was in
+            # A segmentation fault, as of a plug-in, prints the line that it was in
+            faulthandler.enable(sys.__stderr__)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # `µ` where the encoding of the terminal lacks it
-    os.environ.pop("MPLBACKEND", None)  # nothing is drawn in a window, and Matplotlib takes no unknown one
+        # `µ` where the encoding of the terminal lacks it
+        sys.stdout.reconfigure(errors="backslashreplace")
+    # Nothing is drawn in a window, and Matplotlib takes no unknown one
+    os.environ.pop("MPLBACKEND", None)
     if not (epoch := os.environ.get("SOURCE_DATE_EPOCH") or "0").isdecimal():
-        _end(f"SOURCE_DATE_EPOCH must be a whole number of seconds since 1970, got {epoch!r}; unset it")
+        _end(
+            f"SOURCE_DATE_EPOCH must be a whole number of seconds since 1970, got {epoch!r}; unset it"
+        )
     if not hasattr(os, "fork"):
         _end("runs on Linux and macOS; on Windows use the Windows Subsystem for Linux (WSL)")
     try:
@@ -150,8 +195,12 @@ def _carry_out(caught: list[int]) -> None:
             raise
         sys.stderr.write(f"servobench: {line}{_resuming()}\n")
         code = FAILED
-    if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that keep something say so by themselves
-        sys.stderr.write(f"servobench: {'terminated' if signal.SIGTERM in caught else 'interrupted'}\n")
+    if (
+        code == INTERRUPTED
+    ):  # typer's word for KeyboardInterrupt; commands that keep something say so by themselves
+        sys.stderr.write(
+            f"servobench: {'terminated' if signal.SIGTERM in caught else 'interrupted'}\n"
+        )
     sys.exit(code)
 
 
@@ -217,9 +266,8 @@ def _line_for_user(error: ValueError | ImportError | RecursionError | MemoryErro
     if isinstance(error, RecursionError) and "--debug" not in sys.argv:
         return "the input is nested too deeply"
     if isinstance(error, MemoryError) and "--debug" not in sys.argv:
-        return (
-            f"the memory is not enough: {str(error) or 'no more is free'}; make the work smaller, or use fewer workers"
-        )
+        shortage = str(error) or "no more is free"
+        return f"the memory is not enough: {shortage}; make the work smaller, or use fewer workers"
     return str(error) if isinstance(error, ConfigurationError) else None
 
 

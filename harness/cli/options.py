@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
 
-ABSENT: Final[dict[tuple[Any, Any], str]] = {}  # command and option -> why it does not have this option of others
+ABSENT: Final[
+    dict[tuple[Any, Any], str]
+] = {}  # command and option -> why it does not have this option of others
 
 
 class Value(NamedTuple):
@@ -37,7 +39,9 @@ class Value(NamedTuple):
 
     def several(self) -> Value:
         """Return the value of an option that takes a comma-separated list of these."""
-        return Value(f"{self.word}S", selection.completing_lists(self.complete) if self.complete else None)
+        return Value(
+            f"{self.word}S", selection.completing_lists(self.complete) if self.complete else None
+        )
 
 
 PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH, CHALLENGE = (
@@ -45,7 +49,8 @@ PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH, CHALLENGE = (
     for kind in ("plants", "controllers", "estimators", "tasks", "mismatch", "challenges")
 )
 ROBOT, SENSING = (
-    Value("NAME", selection.completing(kind), partial(selection.choose, kind)) for kind in ("robot", "sensing")
+    Value("NAME", selection.completing(kind), partial(selection.choose, kind))
+    for kind in ("robot", "sensing")
 )
 
 
@@ -70,7 +75,11 @@ def named_option(
     ABSENT.update(((command, name), reason) for command, reason in (absent or {}).items())
 
     def check(context: typer.Context, text: Any) -> Any:  # noqa: ANN401 - typer's own word for it
-        return text if kind.check is None or text is None or context.resilient_parsing else kind.check(text)
+        return (
+            text
+            if kind.check is None or text is None or context.resilient_parsing
+            else kind.check(text)
+        )
 
     return typer.Option(
         *name.split(), metavar=kind.word, help=words, autocompletion=kind.complete,
@@ -94,7 +103,9 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     rows = []
-    camera = [("camera", None, CameraOption)] if (function.__name__, "--camera") not in ABSENT else []
+    camera = (
+        [("camera", None, CameraOption)] if (function.__name__, "--camera") not in ABSENT else []
+    )
     for name, parameter in signature(function).parameters.items():
         rows += camera if name == "robot" else []
         if name not in groups:
@@ -102,7 +113,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             continue
         types = get_type_hints(groups[name], include_extras=True)
         given = {} if parameter.default is Parameter.empty else vars(parameter.default)
-        rows += [(each.name, given.get(each.name, each.default), types[each.name]) for each in fields(groups[name])]
+        rows += [
+            (each.name, given.get(each.name, each.default), types[each.name])
+            for each in fields(groups[name])
+        ]
         rows += camera if "robot" in types else []
 
     @wraps(function)
@@ -119,7 +133,9 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             values["mismatch"] = "none" if find_robot(values["robot"]).twin else DEFAULT_MISMATCH
         for name, group in groups.items():
             values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
-        with offering():  # a user's own controllers have their names for as long as the command takes
+        with (
+            offering()
+        ):  # a user's own controllers have their names for as long as the command takes
             function(**values)
 
     keyword = partial(Parameter, kind=Parameter.KEYWORD_ONLY)
@@ -133,9 +149,12 @@ DEFAULT_MISMATCH: Final = "moderate"
 AXES = "none, factory, lab, moderate, severe, or axes, such as links=10%+tool=20mm"
 LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
 ROBOT_WORDS = (
-    "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: UR calibration (.yaml), DH table or twin (.toml), .urdf."
+    "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: "
+    "UR calibration (.yaml), DH table or twin (.toml), .urdf."
 )
-CAMERA_WORDS = "Your camera: a .toml, a camera_info.yaml of ROS or a file of OpenCV, in place of the bench's."
+CAMERA_WORDS = (
+    "Your camera: a .toml, a camera_info.yaml of ROS or a file of OpenCV, in place of the bench's."
+)
 SENSING_WORDS = "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand."
 NO_WORLD = {  # command -> why it has neither --robot nor --camera nor --sensing
     "claims": "the claims are those of the paper, which are about a UR5 and the ball in 3-D before the bench's camera",
@@ -153,23 +172,34 @@ NO_SENSING = {
 }
 RobotOption = Annotated[str, named_option("--robot", ROBOT, ROBOT_WORDS, NO_WORLD)]
 # Every command that has --robot has --camera, too.
-CameraOption = Annotated[Path | None, named_option("--camera", "FILE", CAMERA_WORDS, NO_WORLD | NO_CAMERA)]
-SensingOption = Annotated[str, named_option("--sensing", SENSING, SENSING_WORDS, NO_WORLD | NO_CAMERA | NO_SENSING)]
+CameraOption = Annotated[
+    Path | None, named_option("--camera", "FILE", CAMERA_WORDS, NO_WORLD | NO_CAMERA)
+]
+SensingOption = Annotated[
+    str, named_option("--sensing", SENSING, SENSING_WORDS, NO_WORLD | NO_CAMERA | NO_SENSING)
+]
 PlantsOption = Annotated[str, option(PLANT.several(), LISTED.format("plants"))]
 ControllersOption = Annotated[str, option(CONTROLLER.several(), LISTED.format("controllers"))]
-TasksOption = Annotated[str, option(TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")]
+TasksOption = Annotated[
+    str, option(TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")
+]
 TaskOption = Annotated[str, option(TASK, "Name of the task; servobench tasks lists them.")]
-MismatchOption = Annotated[str, option(MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")]
+MismatchOption = Annotated[
+    str, option(MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")
+]
 SeedsOption = Annotated[str, option("SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[
-    Path, named_option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")
+    Path,
+    named_option("--out", "FOLDER", "Folder for the results; with --resume the one to continue."),
 ]
 RunIdOption = Annotated[
-    str | None, named_option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")
+    str | None,
+    named_option("--run", "RUN_ID", "The run_id, where the folder has more than one run."),
 ]
 JsonOption = Annotated[bool, switch("--json", "Print JSON, for other programs.")]
 DebugOption = Annotated[
-    bool, execution_switch("--debug", "Run in this process, and stop at the first crash with its trace.")
+    bool,
+    execution_switch("--debug", "Run in this process, and stop at the first crash with its trace."),
 ]
 
 
@@ -180,7 +210,9 @@ class Combinations:
     plants: PlantsOption = "kinematic"
     controllers: ControllersOption = "all"
     tasks: TasksOption = "exp1,exp2,exp3,exp4,circle"
-    mismatch: Annotated[str, option(MISMATCH.several(), f"Comma-separated: {AXES}.")] = DEFAULT_MISMATCH
+    mismatch: Annotated[str, option(MISMATCH.several(), f"Comma-separated: {AXES}.")] = (
+        DEFAULT_MISMATCH
+    )
     robot: RobotOption = "ur5"
     sensing: Annotated[
         str,
@@ -217,7 +249,9 @@ class Limited:
     run_timeout: Annotated[
         float | None,
         execution_option(
-            "SECONDS", "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.", min=0.001
+            "SECONDS",
+            "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
+            min=0.001,
         ),
     ] = None
     run_memory: Annotated[
@@ -231,7 +265,8 @@ class Limited:
     isolate: Annotated[
         bool,
         execution_switch(
-            "--isolate/--no-isolate", "Keep plug-ins and foreign FMUs in processes of their own, with limits."
+            "--isolate/--no-isolate",
+            "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
         ),
     ] = True
 
@@ -253,10 +288,12 @@ class Place(Limited):
     """Processors or cluster that carry runs out."""
 
     workers: Annotated[
-        int | None, execution_option("COUNT", "Worker processes; default: one for each processor.", min=1)
+        int | None,
+        execution_option("COUNT", "Worker processes; default: one for each processor.", min=1),
     ] = None
     scheduler: Annotated[
-        str | None, execution_option("ADDRESS", "Address of a Dask scheduler to which runs are sent.")
+        str | None,
+        execution_option("ADDRESS", "Address of a Dask scheduler to which runs are sent."),
     ] = None
 
 
@@ -264,7 +301,9 @@ class Place(Limited):
 class Running(Place):
     """Execution of runs that can be resumed."""
 
-    resume: Annotated[bool, execution_switch("--resume", "Continue in a folder whose runs were interrupted.")] = False
+    resume: Annotated[
+        bool, execution_switch("--resume", "Continue in a folder whose runs were interrupted.")
+    ] = False
 
     def execution(self) -> Execution:
         """Return it as the driver takes it."""
@@ -278,10 +317,15 @@ class Batched(Running):
     """Execution of a batch or of a part of it, and treatment of runs that fail."""
 
     part: Annotated[
-        str, execution_option("K/N", "Carry out part K of N of the runs only; servobench merge puts parts together.")
+        str,
+        execution_option(
+            "K/N", "Carry out part K of N of the runs only; servobench merge puts parts together."
+        ),
     ] = "1/1"
     debug: DebugOption = False
-    strict: Annotated[bool, execution_switch("--strict", "End with exit code 1 if a run failed.")] = False
+    strict: Annotated[
+        bool, execution_switch("--strict", "End with exit code 1 if a run failed.")
+    ] = False
 
     def execution(self) -> Execution:
         """Return it as the driver takes it; runs that are debugged go one by one in this process.
@@ -290,8 +334,14 @@ class Batched(Running):
             ConfigurationError: --part does not name one of N parts, or processes or a limit for runs that are debugged.
         """
         words = self.part.split("/")
-        if len(words) != 2 or not all(map(str.isdecimal, words)) or not 1 <= int(words[0]) <= int(words[1]):
-            raise ConfigurationError(f"--part names a part of how many, 1/40 to 40/40 for instance, got {self.part!r}")
+        if (
+            len(words) != 2
+            or not all(map(str.isdecimal, words))
+            or not 1 <= int(words[0]) <= int(words[1])
+        ):
+            raise ConfigurationError(
+                f"--part names a part of how many, 1/40 to 40/40 for instance, got {self.part!r}"
+            )
         how = replace(super().execution(), part=(int(words[0]), int(words[1])))
         if not self.debug:
             return how
@@ -303,7 +353,9 @@ class Batched(Running):
         }
         for option, value in given.items():
             if value:
-                raise ConfigurationError(f"--debug carries runs out one by one in this process; leave {option} away")
+                raise ConfigurationError(
+                    f"--debug carries runs out one by one in this process; leave {option} away"
+                )
         return replace(how, workers=1, debug=True)
 
 
@@ -312,10 +364,14 @@ class Overrides:
     """Settings that a user gives."""
 
     set_: Annotated[
-        list[str] | None, named_option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated.")
+        list[str] | None,
+        named_option(
+            "--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated."
+        ),
     ] = None
     config: Annotated[
-        Path | None, option("FILE", "TOML file with settings; a [section] for each plant, controller or task.")
+        Path | None,
+        option("FILE", "TOML file with settings; a [section] for each plant, controller or task."),
     ] = None
 
     def settings(self, *further: str) -> Settings:

@@ -18,7 +18,8 @@ from servobench.harness.cli.terminal import end_interrupted
 from servobench.plant.contract.files import harmless
 
 MANY_RUNS: Final = 10_000  # from which on their number and time are told first
-FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
+# [s] to the first line, and from line to line at least; [1] of the time so far
+FIRST_LINE, LINE_SHARE = (5.0, 0.1)
 
 
 def show_time(seconds: float) -> str:
@@ -92,9 +93,19 @@ class Bars(progress.Progress):
         shown: false where a debugger may need the terminal.
     """
 
-    def __init__(self, console: Console, *further: progress.ProgressColumn, shown: bool = True) -> None:
-        counts = progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn()
-        times = progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn()
+    def __init__(
+        self, console: Console, *further: progress.ProgressColumn, shown: bool = True
+    ) -> None:
+        counts = (
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+        )
+        times = (
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("left"),
+            progress.TimeRemainingColumn(),
+        )
         super().__init__(*counts, *further, *times, console=console, disable=not shown)
         self._lines, self._begun = Lines(), 0
 
@@ -147,7 +158,9 @@ class ConsoleObserver(Observer):
         self._first = done
         if total - done >= MANY_RUNS:
             self.note(f"{total - done:,} runs begin; Ctrl-C ends them, and --resume goes on")
-        self._bars = self._shown.enter_context(Bars(self._console, RateColumn(), shown=self._shows_bar))
+        self._bars = self._shown.enter_context(
+            Bars(self._console, RateColumn(), shown=self._shows_bar)
+        )
         self._bar = self._bars.begin("running", total, done)
         if done == total:
             self.close()
@@ -198,7 +211,8 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
         observer.close()
         if not any(folder.rglob("*.parquet")):
             raise
-        done = max(observer.done, sum(map(len, results.finished_runs(folder))))  # a last one may be untold
+        # A last one may be untold
+        done = max(observer.done, sum(map(len, results.finished_runs(folder))))
         kept = f"{done} of {observer.total} runs are finished and kept in {folder}"
         end_interrupted(kept, "the same call with --resume and this --out continues")
     finally:

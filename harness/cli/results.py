@@ -11,7 +11,14 @@ import typer
 
 from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
+from servobench.harness.cli.terminal import (
+    FAILED,
+    console,
+    print_json,
+    print_markdown,
+    print_tables,
+    say,
+)
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, writing_together
 
@@ -34,7 +41,10 @@ def statistics(
     ] = None,
     markdown: Annotated[bool, switch("--markdown", "Print the tables as Markdown.")] = False,
     latex: Annotated[
-        bool, switch("--latex", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
+        bool,
+        switch(
+            "--latex", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -42,12 +52,19 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.folder import describe_controllers, latex_tables, methods_paragraph, titled_runs
+    from servobench.harness.analysis.folder import (
+        describe_controllers,
+        latex_tables,
+        methods_paragraph,
+        titled_runs,
+    )
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
     if markdown + latex + as_json > 1:
-        raise ConfigurationError("--markdown, --latex and --json are ways to print the same; give one of them")
+        raise ConfigurationError(
+            "--markdown, --latex and --json are ways to print the same; give one of them"
+        )
     runs = titled_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
@@ -68,8 +85,12 @@ def statistics(
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
-    out: Annotated[Path | None, option("FILE", "The page; default: report.html in the folder.")] = None,
+    folder: Annotated[
+        Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")
+    ],
+    out: Annotated[
+        Path | None, option("FILE", "The page; default: report.html in the folder.")
+    ] = None,
 ) -> None:
     """Write one page about a results folder.
 
@@ -89,16 +110,33 @@ def report(
 
 
 def figures(
-    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
-    kind: Annotated[str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")] = "all",
-    controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
-    names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
-    width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 252pt, 89mm or 3.5in.")] = "7.2in",
+    folder: Annotated[
+        Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")
+    ],
+    kind: Annotated[
+        str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")
+    ] = "all",
+    controllers: Annotated[
+        str, option("NAMES", "Comma-separated names; default: all of the folder.")
+    ] = "all",
+    names: Annotated[
+        str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")
+    ] = "",
+    width: Annotated[
+        str, option("LENGTH", "Width of a column of a paper, such as 252pt, 89mm or 3.5in.")
+    ] = "7.2in",
     title: Annotated[bool, switch("--title/--no-title", "Write a title above each figure.")] = True,
     format_: Annotated[
-        str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")
+        str,
+        named_option(
+            "--format",
+            "NAMES",
+            "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).",
+        ),
     ] = "pdf",
-    out: Annotated[Path | None, option("FOLDER", "Folder of the figures; default: figures in the folder.")] = None,
+    out: Annotated[
+        Path | None, option("FOLDER", "Folder of the figures; default: figures in the folder.")
+    ] = None,
 ) -> None:
     """Draw figures of a folder for a paper.
 
@@ -116,7 +154,9 @@ def figures(
     shown = selection.split_names("controllers", controllers, known)
     own = [name.strip() for name in names.split(",")] if names else shown
     if len(own) != len(shown):
-        raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")
+        raise ConfigurationError(
+            f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}"
+        )
     if len(set(own)) < len(own):
         raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
     if "pgf" in formats:
@@ -125,7 +165,11 @@ def figures(
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
     files = []
-    with console.status("drawing the figures"), accessing(target), writing_together(target) as partial:
+    with (
+        console.status("drawing the figures"),
+        accessing(target),
+        writing_together(target) as partial,
+    ):
         for named in folder_figures(folder, choice):
             made = save_figure(named.figure, partial / named.stem, formats, exact_width=True)
             files += [target / path.name for path in made]
@@ -139,7 +183,9 @@ def figures(
     say("\n".join(map(str, files)))
 
 
-def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
+def collect(
+    folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")],
+) -> None:
     """Make the tables of a batch that was killed."""
     from servobench.harness.batch import results
     from servobench.harness.batch.lock import locked
@@ -175,10 +221,13 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Results folder of run or compare, which keep steps.")
+    ],
     out: Annotated[Path, option("FOLDER", "New folder for the files.")],
     format_: Annotated[
-        str, named_option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
+        str,
+        named_option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap)."),
     ] = "csv",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
@@ -200,7 +249,9 @@ def print_faults(folder: Path, runs: pd.DataFrame) -> None:
     saturation = runs.reindex(columns=["controller", "saturation_fraction"])
     for name, share in saturation.groupby("controller").median().itertuples():
         if share > MAX_SATURATED and name in own:
-            remark(f"{name} commands more than a joint's limit in {share:.0%} of its periods; commands are in rad/s")
+            remark(
+                f"{name} commands more than a joint's limit in {share:.0%} of its periods; commands are in rad/s"
+            )
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
@@ -216,12 +267,16 @@ def judge(folder: Path, *, strict: bool, whole: bool = True) -> None:
     from servobench.harness.batch import results
     from servobench.harness.run.result import COMPLETED
 
-    completed = [table["status"] == COMPLETED for table in results.iterate_runs(folder, ("status",))]
+    completed = [
+        table["status"] == COMPLETED for table in results.iterate_runs(folder, ("status",))
+    ]
     count, failed = sum(map(len, completed)), sum(int((~each).sum()) for each in completed)
     lack = results.missing_line(count, results.read_manifest(folder).get("run_count", 0))
     if whole:
         say(lack)
     if failed:
-        say(f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder / results.FAILURES}")
+        say(
+            f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder / results.FAILURES}"
+        )
     if strict and (failed or (whole and lack)):
         sys.exit(FAILED)

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option, switch
+from servobench.harness.cli.options import (
+    CONTROLLER,
+    ESTIMATOR,
+    PLANT,
+    named_option,
+    option,
+    switch,
+)
 from servobench.harness.cli.results import judge, print_faults, report
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
@@ -22,7 +29,8 @@ if TYPE_CHECKING:
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 
 OutOption = Annotated[
-    Path | None, named_option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
+    Path | None,
+    named_option("--out", "FOLDER", "New folder for the results; default: results/<date-time>."),
 ]
 FiguresOption = Annotated[bool, switch("--figures/--no-figures", "Also draw the figures, as PNG.")]
 ReportOption = Annotated[bool, switch("--report/--no-report", "Also make the page report.html.")]
@@ -32,23 +40,30 @@ def run(
     method: Annotated[
         str | None,
         typer.Argument(
-            metavar="CONTROLLER", help="Short for --controller.", show_default=False, autocompletion=CONTROLLER.complete
+            metavar="CONTROLLER",
+            help="Short for --controller.",
+            show_default=False,
+            autocompletion=CONTROLLER.complete,
         ),
     ] = None,
     *,
     plant: Annotated[
         str | None,
         option(
-            PLANT, "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed."
+            PLANT,
+            "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed.",
         ),
     ] = None,
     controller: Annotated[
         str | None,
         option(
-            CONTROLLER, f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}."
+            CONTROLLER,
+            f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
         ),
     ] = None,
-    estimator: Annotated[str | None, option(ESTIMATOR, "Compose the law --controller with this estimator.")] = None,
+    estimator: Annotated[
+        str | None, option(ESTIMATOR, "Compose the law --controller with this estimator.")
+    ] = None,
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = options.DEFAULT_MISMATCH,
     robot: options.RobotOption = "ur5",
@@ -71,7 +86,9 @@ def run(
     from servobench.harness.config.registry import default_plant
 
     if None not in (method, controller) and method != controller:
-        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
+        raise ConfigurationError(
+            f"two controllers are named, {method} and --controller {controller}; a run has one"
+        )
     if plant is None:
         plant, why = default_plant()
         if why:
@@ -82,7 +99,9 @@ def run(
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.choose("controllers", law if estimator is None else f"{law}+{estimator}")
     seeds = check_seeds((seed,), f"got {seed}")
-    batch = Batch((plant,), (name,), (selection.choose("tasks", task),), (mismatch,), seeds, robot, (sensing,))
+    batch = Batch(
+        (plant,), (name,), (selection.choose("tasks", task),), (mismatch,), seeds, robot, (sensing,)
+    )
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
     _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=True)
@@ -104,11 +123,20 @@ def compare(
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
     campaign, how = comparison(batch, overrides.settings()), running.execution()
-    _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=running.strict)
+    _carry_out(
+        campaign,
+        out,
+        how,
+        with_figures=with_figures,
+        with_report=with_report,
+        strict=running.strict,
+    )
 
 
 def merge(
-    folders: Annotated[list[Path], typer.Argument(help="Results folders of the parts of a batch, of --part.")],
+    folders: Annotated[
+        list[Path], typer.Argument(help="Results folders of the parts of a batch, of --part.")
+    ],
     out: Annotated[Path, option("FOLDER", "New folder for all of their runs.")],
 ) -> None:
     """Put the parts of a batch into one folder.
@@ -124,7 +152,9 @@ def merge(
 
 def train(
     *,
-    controller: Annotated[str, option(CONTROLLER, "Name of the controller whose networks to train.")] = "rbfnn_mfac",
+    controller: Annotated[
+        str, option(CONTROLLER, "Name of the controller whose networks to train.")
+    ] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     overrides: options.Overrides,
@@ -159,7 +189,13 @@ def new_folder() -> Path:
 
 
 def _carry_out(
-    campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
+    campaign: Campaign,
+    out: Path | None,
+    how: Execution,
+    *,
+    with_figures: bool,
+    with_report: bool,
+    strict: bool,
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
     from servobench.harness.analysis.folder import describe_controllers, titled_runs
@@ -184,11 +220,20 @@ def _carry_out(
             with console.status("drawing the figures"):
                 figures = draw_figures(folder)
                 results.vouch(folder, figures)
-        say(f"tables and {len(figures)} figures in {folder}" if with_figures else f"tables in {folder}")
+        say(
+            f"tables and {len(figures)} figures in {folder}"
+            if with_figures
+            else f"tables in {folder}"
+        )
         if with_report:
             try:
                 report(folder)
-            except (ConfigurationError, ImportError) as error:  # the runs are safe, and the report can be made again
-                missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
+            except (
+                ConfigurationError,
+                ImportError,
+            ) as error:  # the runs are safe, and the report can be made again
+                missing = (
+                    missing_extra(error, "the page") if isinstance(error, ImportError) else None
+                )
                 say(f"no report: {missing or error}")
     judge(folder, strict=strict, whole=how.part == (1, 1))

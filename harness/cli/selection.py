@@ -21,9 +21,15 @@ class Names(NamedTuple):
     """The names of a kind."""
 
     known: Callable[[], Sequence[str]]  # returns all of them
-    find: Callable[[str], Any]  # refuses a wrong word; a text that it returns is the name that the word stands for
-    tried: Word | None = None  # plants or controllers, of which those of third parties are tried if `all` is meant
-    begun: Callable[[str], Iterable[str]] | None = None  # returns the offers for a word, where names have parts
+    find: Callable[
+        [str], Any
+    ]  # refuses a wrong word; a text that it returns is the name that the word stands for
+    tried: Word | None = (
+        None  # plants or controllers, of which those of third parties are tried if `all` is meant
+    )
+    begun: Callable[[str], Iterable[str]] | None = (
+        None  # returns the offers for a word, where names have parts
+    )
 
 
 @cache
@@ -40,7 +46,9 @@ def names_of(kind: str) -> Names:
         case "controllers":
             from servobench.harness.config.registry import controller_names
 
-            return Names(controller_names, partial(_choose, "controller"), "controller", _begun_controllers)
+            return Names(
+                controller_names, partial(_choose, "controller"), "controller", _begun_controllers
+            )
         case "estimators":
             from servobench.controllers.methods import ESTIMATORS
 
@@ -128,7 +136,9 @@ def choose(kind: str, word: str) -> str:
     """Return the name of a kind that a user named, or whose place was given; a wrong one is refused."""
     names = names_of(kind)
     if len(split_words(word, names.known())) > 1:
-        raise ConfigurationError(f"{word!r} names several, where one is wanted; compare takes several")
+        raise ConfigurationError(
+            f"{word!r} names several, where one is wanted; compare takes several"
+        )
     name = _chosen(names.find, word)
     _tell_unused(names, [name])
     return name

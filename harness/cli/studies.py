@@ -11,7 +11,14 @@ import typer
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
+from servobench.harness.cli.terminal import (
+    FAILED,
+    console,
+    end_interrupted,
+    print_rows,
+    print_tables,
+    say,
+)
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.files import split_words
 
@@ -26,8 +33,12 @@ if TYPE_CHECKING:
     from servobench.harness.studies.tuning.campaign import Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 
-DEFAULT_CONTROLLERS = "regression_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
-SWEPT = options.Combinations(controllers="rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid", tasks="random", seeds="10")
+DEFAULT_CONTROLLERS = (
+    "regression_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
+)
+SWEPT = options.Combinations(
+    controllers="rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid", tasks="random", seeds="10"
+)
 
 
 def sweep(
@@ -36,9 +47,14 @@ def sweep(
     combinations: options.Combinations = SWEPT,
     vary: Annotated[
         list[str] | None,
-        option("KEY=VALUES", "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05."),
+        option(
+            "KEY=VALUES",
+            "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05.",
+        ),
     ] = None,
-    noise: Annotated[str, option("NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
+    noise: Annotated[
+        str, option("NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")
+    ] = "",
     latency: Annotated[str, option("SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
     period: Annotated[str, option("SECONDS", "Control periods [s]: --vary period=...")] = "",
     running: options.Batched,
@@ -59,12 +75,19 @@ def sweep(
 
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
-    campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
+    campaign = Campaign(
+        SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings()
+    )
     execution = running.execution()
     with watching(console, out, execution) as how:
         carry_out(campaign, out, how)
-    columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
-    legend = f"{outcome_legend(results.iterate_runs(out, columns))}\n{MISSING} as configured".lstrip()
+    columns = (
+        *SWEEP_COLUMNS,
+        *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)),
+    )
+    legend = (
+        f"{outcome_legend(results.iterate_runs(out, columns))}\n{MISSING} as configured".lstrip()
+    )
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
     say(describe_controllers(out))
     say(f"table in {out / results.RUNS}")
@@ -80,7 +103,10 @@ def robustness(
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
-        str, option("NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
+        str,
+        option(
+            "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."
+        ),
     ] = "",
     running: options.Running,
     overrides: options.Overrides,
@@ -110,10 +136,15 @@ def suite(
     *,
     out: options.FolderOption,
     challenges: Annotated[
-        str, option(CHALLENGE.several(), "Comma-separated names, or .toml files of your own; default: all names.")
+        str,
+        option(
+            CHALLENGE.several(),
+            "Comma-separated names, or .toml files of your own; default: all names.",
+        ),
     ] = selection.ALL,
     grade: Annotated[
-        str, option("NAMES", "Comma-separated grades, I, II or III, of the challenges; default: all.")
+        str,
+        option("NAMES", "Comma-separated grades, I, II or III, of the challenges; default: all."),
     ] = "",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     plants: Annotated[
@@ -121,7 +152,10 @@ def suite(
     ] = "",
     seeds: options.SeedsOption = "40",
     reference_seeds: Annotated[
-        int | None, option("COUNT", "Robots on which references run and scores are given; default: all.", min=1)
+        int | None,
+        option(
+            "COUNT", "Robots on which references run and scores are given; default: all.", min=1
+        ),
     ] = None,
     running: options.Running,
     overrides: options.Overrides,
@@ -150,15 +184,24 @@ def claims(
     *,
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[int, option("COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
+    seeds: Annotated[
+        int, option("COUNT", "Robots for each move; two fifths of them for the circle.")
+    ] = 500,
     division: Annotated[
         Literal["equipped", "published", "both"],
-        option("NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."),
+        option(
+            "NAME",
+            "Form of the methods: equipped (all aids), published (the law as printed) or both.",
+        ),
     ] = "both",
     mismatch: options.MismatchOption = "moderate",
     running: options.Running,
     check: Annotated[
-        Path | None, option("FILE", "Table of answers that must come out the same; the exit code is 1 if they differ.")
+        Path | None,
+        option(
+            "FILE",
+            "Table of answers that must come out the same; the exit code is 1 if they differ.",
+        ),
     ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
@@ -194,25 +237,34 @@ def tune(
     ] = "all",
     studies: Annotated[
         int,
-        option("COUNT", "Studies of each method; their results and the values in use meet on a second set of robots."),
+        option(
+            "COUNT",
+            "Studies of each method; their results and the values in use meet on a second set of robots.",
+        ),
     ] = 3,
     trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
-        int, option("COUNT", "Upper limit on the points of the coordinate search that ends a study.")
+        int,
+        option("COUNT", "Upper limit on the points of the coordinate search that ends a study."),
     ] = 100,
     robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 12,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
     offset: Annotated[
-        int, option("INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
+        int,
+        option("INTEGER", "First seed, counted from the beginning of the range kept for tuning."),
     ] = 0,
     study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
-        bool, switch("--check", "Change each tuned value in use one by one instead, and name changes that are better.")
+        bool,
+        switch(
+            "--check",
+            "Change each tuned value in use one by one instead, and name changes that are better.",
+        ),
     ] = False,
-    out: Annotated[Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
-        Path("results") / "tuning"
-    ),
+    out: Annotated[
+        Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")
+    ] = (Path("results") / "tuning"),
 ) -> None:
     """Search for the best settings of each method.
 
@@ -220,7 +272,12 @@ def tune(
     """
     from servobench.harness.batch.blocks import open_workers
     from servobench.harness.batch.lock import locked
-    from servobench.harness.studies.tuning.campaign import TuningPlan, check_study_folder, open_methods, write_results
+    from servobench.harness.studies.tuning.campaign import (
+        TuningPlan,
+        check_study_folder,
+        open_methods,
+        write_results,
+    )
     from servobench.harness.studies.tuning.objective import TuningSet
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
 
@@ -230,12 +287,16 @@ def tune(
         second = runs.second()
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     check_study_folder(out)
-    opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
+    opening = open_workers(
+        place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names
+    )
     with opening as opened, locked(out):
         if check:
             _check(out, names, second, opened)
             return
-        say(f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less")
+        say(
+            f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less"
+        )
         methods = open_methods(out, plan)
         interrupted = not _advance(methods, plan, opened)
     if results := write_results(out, methods):
@@ -282,7 +343,10 @@ def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers
         return
     rows = []
     for change in found:
-        values = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in (change.before, change.after))
+        values = (
+            f"{value:.4g}" if isinstance(value, float) else str(value)
+            for value in (change.before, change.after)
+        )
         scores = f"{change.score_before:.4f}", f"{change.score_after:.4f}", f"{change.gain:.1%}"
         rows.append((change.controller, change.key, *values, *scores))
     print_rows(("controller", "key", "in use", "better", "score", "with the change", "gain"), rows)
@@ -299,7 +363,10 @@ def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> b
     total = plan.studies * (plan.trials + plan.search)
     try:
         with Bars(console, TextColumn("points, best {task.fields[best]}")) as bars:
-            shown = {method.name: bars.begin(method.name, total, method.done, best="–") for method in methods}
+            shown = {
+                method.name: bars.begin(method.name, total, method.done, best="–")
+                for method in methods
+            }
             for method in advance(methods, plan, workers):
                 score = method.ledger.best()
                 best = "–" if score is None else f"{score:.4f}"
@@ -314,10 +381,25 @@ def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> b
 def _print_tuned(results: Mapping[str, TunedValues]) -> None:
     rows = []
     for name, tuned in results.items():
-        numbers = (tuned.score_of_defaults, tuned.score, tuned.second_score_of_defaults, tuned.second_score)
+        numbers = (
+            tuned.score_of_defaults,
+            tuned.score,
+            tuned.second_score_of_defaults,
+            tuned.second_score,
+        )
         spread = " ".join(f"{study.second_score:.4f}" for study in tuned.studies)
         rows.append((name, *(f"{number:.4f}" for number in numbers), spread))
-    print_rows(("controller", "score of defaults", "score tuned", "second set, defaults", "tuned", "its studies"), rows)
+    print_rows(
+        (
+            "controller",
+            "score of defaults",
+            "score tuned",
+            "second set, defaults",
+            "tuned",
+            "its studies",
+        ),
+        rows,
+    )
     for name, tuned in results.items():
         for edge in tuned.edges:
             say(f"{name}: {edge}; with these values in use the next study searches a wider box")
@@ -327,7 +409,9 @@ TABLE = "analyse.csv"
 
 
 def analyse(
-    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
+    controllers: Annotated[
+        list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")
+    ],
     *,
     mismatch: options.MismatchOption = "none",
     seed: Annotated[int, option("INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
@@ -337,17 +421,29 @@ def analyse(
         option("NAME", "Jacobian that estimators are fixed at: true, nominal or estimated."),
     ] = "true",
     identify: Annotated[
-        bool, switch("--identify", "Identify all loops from logged small motions, while estimators go on learning.")
+        bool,
+        switch(
+            "--identify",
+            "Identify all loops from logged small motions, while estimators go on learning.",
+        ),
     ] = False,
-    simulate: Annotated[bool, switch("--simulate", "Also find the limits of gain and latency by simulation.")] = False,
+    simulate: Annotated[
+        bool, switch("--simulate", "Also find the limits of gain and latency by simulation.")
+    ] = False,
     overrides: options.Overrides,
-    out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results") / "analyse",
+    out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results")
+    / "analyse",
 ) -> None:
     """Analyse the loop at rest: margins, Bode, Nyquist, step.
 
     Also sensitivity, and stability over gain and latency.
     """
-    from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
+    from servobench.harness.analysis.loops.loop_analysis import (
+        LEGEND,
+        analyse_loop,
+        loop_table,
+        printed,
+    )
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.contract.files import accessing, write_csv, writing_together
 
@@ -377,7 +473,9 @@ def analyse(
     say(f"table in {out / TABLE}, pictures in {page}")
 
 
-def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
+def _resolved(
+    controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings
+) -> list[ResolvedRun]:
     """Return a run for each controller on the kinematic plant."""
     from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
     from servobench.harness.run.request import RunRequest, read_mismatch
@@ -386,7 +484,9 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, sett
     names = selection.split("controllers", ",".join(controllers), robot=robot)
     check_settings(settings, [PLANT, TASK, *names])
     drawn = read_mismatch(mismatch)
-    return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]
+    return [
+        resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names
+    ]
 
 
 def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
@@ -399,5 +499,9 @@ def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
     rows = []
     for warm in map(warm_up, runs):
         loop = SmallLoop(warm) if isinstance(warm.controller, ServoController) else None
-        rows.append((float("nan"), float("nan")) if loop is None else (loop.gain_limit(), loop.latency_limit()))
+        rows.append(
+            (float("nan"), float("nan"))
+            if loop is None
+            else (loop.gain_limit(), loop.latency_limit())
+        )
     return pd.DataFrame(rows, columns=["simulated_gain_margin", "simulated_latency_limit_s"])

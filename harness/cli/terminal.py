@@ -43,7 +43,9 @@ class Terminal(Console):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-if os.environ.get("COLUMNS", "").strip("0") == "":  # as some programs tell their children: no line would be printed
+if (
+    os.environ.get("COLUMNS", "").strip("0") == ""
+):  # as some programs tell their children: no line would be printed
     os.environ.pop("COLUMNS", None)
 console = Terminal(emoji=False)  # `pixel:hand:` is none
 
@@ -64,7 +66,8 @@ def ending_alike() -> Iterator[list[int]]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         caught.append(number)
-        handler = signal.getsignal(signal.SIGINT)  # That of asyncio, while its loop runs, raises nothing amid a task.
+        # That of asyncio, while its loop runs, raises nothing amid a task.
+        handler = signal.getsignal(signal.SIGINT)
         if not callable(handler):
             raise KeyboardInterrupt
         handler(signal.SIGINT, frame)
@@ -76,7 +79,9 @@ def ending_alike() -> Iterator[list[int]]:
         dropped.append(unraisable.exc_type)
         signal.setitimer(signal.ITIMER_REAL, SOON)
 
-    taken = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) != signal.SIG_IGN]
+    taken = [
+        each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) != signal.SIG_IGN
+    ]
     before = {number: signal.signal(number, interrupt) for number in taken}
     for number in (signal.SIGINT, signal.SIGALRM):  # asyncio knows Ctrl-C by the usual handler
         before[number] = signal.signal(number, signal.default_int_handler)
@@ -122,7 +127,12 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
                 padding=(0, 1, 0, 0),
             )  # fmt: skip
             for name, width in widths.items():
-                table.add_column(Text(name), justify="left" if name in LEFT else "right", width=width, overflow="fold")
+                table.add_column(
+                    Text(name),
+                    justify="left" if name in LEFT else "right",
+                    width=width,
+                    overflow="fold",
+                )
             for row in rows[list(widths)].itertuples(index=False):
                 table.add_row(*map(Text, row))
             console.print(table)
@@ -149,7 +159,9 @@ def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
     yield _shares(rows[part], least, whole, room)
 
 
-def _shares(rows: pd.DataFrame, least: dict[str, int], whole: dict[str, int], room: int) -> dict[str, int]:
+def _shares(
+    rows: pd.DataFrame, least: dict[str, int], whole: dict[str, int], room: int
+) -> dict[str, int]:
     """Return the widths of columns in one table: the widest give way first, and those of most lines get the rest."""
     names, cells = list(rows.columns), {name: (name, *rows[name]) for name in rows.columns}
     widths = {name: whole[name] for name in names}
@@ -184,6 +196,11 @@ def print_json(value: object) -> None:
 def print_markdown(tables: Iterable[tuple[str, pd.DataFrame]]) -> None:
     """Print tables of text as Markdown."""
     for title, rows in tables:
-        lines = [f"{title}:", "", "| " + " | ".join(rows.columns) + " |", "|---" * len(rows.columns) + "|"]
+        lines = [
+            f"{title}:",
+            "",
+            "| " + " | ".join(rows.columns) + " |",
+            "|---" * len(rows.columns) + "|",
+        ]
         lines += ["| " + " | ".join(row) + " |" for row in rows.itertuples(index=False)]
         say("\n".join(lines) + "\n")

@@ -65,7 +65,9 @@ def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
     if origin is Literal:
         return ", ".join(map(toml, arguments))
     if origin in (Union, UnionType):
-        return " or ".join(filter(None, (allowed(each) for each in arguments if each is not NoneType)))
+        return " or ".join(
+            filter(None, (allowed(each) for each in arguments if each is not NoneType))
+        )
     if origin is tuple:
         each = allowed(arguments[0])
         size = "list" if arguments[-1] is Ellipsis else f"{len(arguments)} numbers"
@@ -127,8 +129,12 @@ def configuration_file(
     for section, config in sections.items():
         settings = list(describe_settings(config))
         normal = {each.key: toml(each.value) for each in describe_settings(defaults[section])}
-        for group in dict.fromkeys(["", *(each.group for each in settings)]):  # nested sections after their own
-            lines = [_line(each, normal.get(each.key, "")) for each in settings if each.group == group]
+        for group in dict.fromkeys(
+            ["", *(each.group for each in settings)]
+        ):  # nested sections after their own
+            lines = [
+                _line(each, normal.get(each.key, "")) for each in settings if each.group == group
+            ]
             title = "" if group else _comment(titles[section])
             parts.append(f"{title}[{_key(section)}{'.' * bool(group)}{group}]\n{''.join(lines)}")
     return "\n".join(parts)
@@ -140,7 +146,9 @@ def _line(setting: Setting, default: str) -> str:
     usual = f"default {default}" if default else "unset by default"
     facts = "; ".join(filter(None, (setting.allowed, usual)))
     words = f"{unit}{setting.meaning or setting.name}".rstrip(".")
-    return _comment(f"{words} ({facts})") + (f"{setting.name} = {value}\n" if value else f"# {setting.name} =\n")
+    return _comment(f"{words} ({facts})") + (
+        f"{setting.name} = {value}\n" if value else f"# {setting.name} =\n"
+    )
 
 
 def _comment(text: str) -> str:

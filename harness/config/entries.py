@@ -34,7 +34,12 @@ from servobench.harness.config.source import (
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError, PlantDiverged, RunFault, configuration_errors
+from servobench.plant.contract.faults import (
+    ConfigurationError,
+    PlantDiverged,
+    RunFault,
+    configuration_errors,
+)
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings, suggest
 from servobench.plant.contract.signals import PlantSpec
@@ -78,7 +83,9 @@ class Guarded:
         except (Exception, SystemExit) as error:
             raise ConfigurationError(describe_at(error)) from error
         if self.kind is not None and not isinstance(made, self.kind):
-            raise ConfigurationError(f"it is built as {type(made).__name__}, wanted a servobench.{self.kind.__name__}")
+            raise ConfigurationError(
+                f"it is built as {type(made).__name__}, wanted a servobench.{self.kind.__name__}"
+            )
         if isinstance(made, Plant | World):
             _check_spec(made)
         return made
@@ -99,7 +106,10 @@ def on_bench(world: type[World], with_config: bool, config: object, setup: Plant
         setup: of the plant.
     """
     build = partial(Guarded(add_checks(world), World, with_config), config)
-    delay, sensing = getattr(config, "command_delay", 0.0), getattr(config, "sensing", SensingConfig())
+    delay, sensing = (
+        getattr(config, "command_delay", 0.0),
+        getattr(config, "sensing", SensingConfig()),
+    )
     return build_bench(build, setup, delay, sensing)
 
 
@@ -115,11 +125,15 @@ def add_checks(world: type[World]) -> type[World]:
             return as_answer("reset", super().reset(seed), self.spec.n, "joint positions")
 
         def advance(self, joint_velocity: FloatArray) -> FloatArray:
-            return as_answer("advance", super().advance(joint_velocity), self.spec.n, "joint positions")
+            return as_answer(
+                "advance", super().advance(joint_velocity), self.spec.n, "joint positions"
+            )
 
         def see(self) -> FloatArray | None:
             seen = super().see()
-            return None if seen is None else as_answer("see", seen, self.spec.m, "features, or None")
+            return (
+                None if seen is None else as_answer("see", seen, self.spec.m, "features, or None")
+            )
 
     def as_answer(method: str, answer: object, size: int, content: str) -> FloatArray:
         wanted = f"{world.__name__}.{method} must return {size} {content}"
@@ -130,7 +144,9 @@ def add_checks(world: type[World]) -> type[World]:
         if values.shape != (size,):
             raise ValueError(f"{wanted}, got shape {values.shape}")
         if not np.isfinite(values).all():
-            raise PlantDiverged(f"{world.__name__}.{method} returned {values.tolist()}, which is not finite")
+            raise PlantDiverged(
+                f"{world.__name__}.{method} returned {values.tolist()}, which is not finite"
+            )
         return values
 
     Checked.__name__ = world.__name__
@@ -205,7 +221,9 @@ class Kind(Generic[Entry]):
             raise ConfigurationError(f"{place} is {_describe(given)}, {self.wanted}")
         named: Entry = replace(entry, name=name or entry.name)
         if not (isinstance(named.name, str) and NAME.fullmatch(named.name)):
-            raise ConfigurationError(f"{place}: the name must be letters, digits and _, got {named.name!r}")
+            raise ConfigurationError(
+                f"{place}: the name must be letters, digits and _, got {named.name!r}"
+            )
         return self.check(named, place)
 
 
@@ -237,7 +255,12 @@ def _plant_of_class(given: type[Any]) -> PlantEntry:
     own_robot = bool(given.own_robot)
     no_model = own_robot and given.nominal_jacobian is Plant.nominal_jacobian
     return PlantEntry(
-        given.__name__, summary_of(given), config or default, build, own_robot=own_robot, no_model=no_model
+        given.__name__,
+        summary_of(given),
+        config or default,
+        build,
+        own_robot=own_robot,
+        no_model=no_model,
     )
 
 
@@ -245,11 +268,15 @@ def _checked_plant(entry: PlantEntry, place: str) -> PlantEntry:
     check_settings(entry.config, place)
     needs: object = entry.needs
     if not isinstance(needs, tuple):
-        raise ConfigurationError(f"{place}: needs must be a tuple of names of modules, got {needs!r}")
+        raise ConfigurationError(
+            f"{place}: needs must be a tuple of names of modules, got {needs!r}"
+        )
     code: Any = entry.build
     if isinstance(code, type) and issubclass(code, World):
         code = partial(on_bench, code, True)
-    engine, config_for = (None if each is None else Guarded(each) for each in (entry.engine, entry.config_for))
+    engine, config_for = (
+        None if each is None else Guarded(each) for each in (entry.engine, entry.config_for)
+    )
     return replace(entry, build=_guarded(code, Plant), engine=engine, config_for=config_for)
 
 
@@ -278,7 +305,9 @@ def check_class(kind: type[Any]) -> None:
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     if missing:
         lacking = " and ".join(", ".join(missing).rsplit(", ", 1))
-        raise ConfigurationError(f"{_class_place(kind)}: class {kind.__name__} lacks {lacking}, which it must define")
+        raise ConfigurationError(
+            f"{_class_place(kind)}: class {kind.__name__} lacks {lacking}, which it must define"
+        )
 
 
 def check_settings(config: Callable[[], Any], place: str) -> None:
@@ -288,19 +317,29 @@ def check_settings(config: Callable[[], Any], place: str) -> None:
         ConfigurationError: says the remedy.
     """
     if not callable(config):
-        raise ConfigurationError(f"{place}: config must be a dataclass or a function, got {config!r}")
-    where, name = (_class_place(config), config.__name__) if isinstance(config, type) else (place, "config")
+        raise ConfigurationError(
+            f"{place}: config must be a dataclass or a function, got {config!r}"
+        )
+    where, name = (
+        (_class_place(config), config.__name__) if isinstance(config, type) else (place, "config")
+    )
     known = fields(config) if isinstance(config, type) and is_dataclass(config) else ()
     needed = [each.name for each in known
               if each.init and each.default is MISSING and each.default_factory is MISSING]  # fmt: skip
     if needed:
-        raise ConfigurationError(f"{where}: every field of {name} needs a default; {', '.join(needed)} has none")
+        raise ConfigurationError(
+            f"{where}: every field of {name} needs a default; {', '.join(needed)} has none"
+        )
     try:
         made = config()
     except (Exception, SystemExit) as error:
         raise ConfigurationError(describe_at(error) or f"{where}: {error}") from error
     if isinstance(made, type) or not is_dataclass(made):
-        remedy = f"put @dataclass(frozen=True) above class {name}" if isinstance(config, type) else "return a dataclass"
+        remedy = (
+            f"put @dataclass(frozen=True) above class {name}"
+            if isinstance(config, type)
+            else "return a dataclass"
+        )
         raise ConfigurationError(f"{where}: the settings {name} are no dataclass; {remedy}")
 
 
@@ -310,13 +349,21 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
         parameters = list(inspect.signature(kind).parameters.values())
     except (TypeError, ValueError):  # of compiled code
         return None
-    positional = [each for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
+    positional = [
+        each
+        for each in parameters
+        if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)
+    ]
     needed = [each for each in positional if each.default is each.empty]
-    only_by_name = [each for each in parameters if each.kind is each.KEYWORD_ONLY and each.default is each.empty]
+    only_by_name = [
+        each for each in parameters if each.kind is each.KEYWORD_ONLY and each.default is each.empty
+    ]
     must = f"{_class_place(kind)}: {kind.__name__}.__init__ must"
     if len(needed) > 2 or only_by_name or not parameters:
         got = ", ".join(["self", *(each.name for each in parameters)])
-        raise ConfigurationError(f"{must} take (self, {argument}) or (self, config, {argument}), got ({got})")
+        raise ConfigurationError(
+            f"{must} take (self, {argument}) or (self, config, {argument}), got ({got})"
+        )
     if len(needed) < 2:
         return None
     wanted = f"{must} name the dataclass of its settings, such as {needed[0].name}: {kind.__name__}Config"
@@ -347,7 +394,11 @@ def _class_place(kind: type[Any]) -> str:
 def _describe(given: object) -> str:
     if isinstance(given, type):
         return f"the class {given.__name__}"
-    return f"the function {given.__name__}" if inspect.isroutine(given) else f"of type {type(given).__name__}"
+    return (
+        f"the function {given.__name__}"
+        if inspect.isroutine(given)
+        else f"of type {type(given).__name__}"
+    )
 
 
 @dataclass(frozen=True)
@@ -380,7 +431,9 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
     """
     found = find_place(text)
     if found is None:
-        raise ConfigurationError(f"{text!r} is no place of a {kind.word}, such as ./mine.py or ./mine.py:Mine")
+        raise ConfigurationError(
+            f"{text!r} is no place of a {kind.word}, such as ./mine.py or ./mine.py:Mine"
+        )
     place = text.partition("=")[2] if found["alias"] else text
     if found["file"]:
         source = SourceFile.read(found["file"])
@@ -390,7 +443,9 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
         source, module = None, import_user_module(found["module"])
         given = _pick(kind, module, found["module"], found["attribute"])
         file, digest = Path(module.__file__ or found["module"]), digest_of_module(found["module"])
-    return Own(kind.word, kind.make_entry(given, place, found["alias"]), place, source, str(file), digest)
+    return Own(
+        kind.word, kind.make_entry(given, place, found["alias"]), place, source, str(file), digest
+    )
 
 
 def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
@@ -415,7 +470,9 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
     found = _members(kind, module)
     if name is not None:
         if not hasattr(module, name):
-            hint = suggest(name, found) if found else f"it defines no {kind.word}{_guard_hint(module)}"
+            hint = (
+                suggest(name, found) if found else f"it defines no {kind.word}{_guard_hint(module)}"
+            )
             raise ConfigurationError(f"{where} has no {name!r}: {hint}")
         return getattr(module, name)
     entry = getattr(module, "ENTRY", None)
@@ -425,11 +482,19 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
         return next(iter(found.values()))
     if not found:
         bases = " or ".join(f"servobench.{each.__name__}" for each in kind.bases)
-        others = [f"the {other.word} {each}" for other in (CONTROLLER, PLANT) for each in _members(other, module)]
+        others = [
+            f"the {other.word} {each}"
+            for other in (CONTROLLER, PLANT)
+            for each in _members(other, module)
+        ]
         hint = f"; it defines {' and '.join(others)}" if others else _guard_hint(module)
-        raise ConfigurationError(f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY{hint}")
+        raise ConfigurationError(
+            f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY{hint}"
+        )
     first, *_ = found
-    raise ConfigurationError(f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}")
+    raise ConfigurationError(
+        f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}"
+    )
 
 
 def _guard_hint(module: ModuleType) -> str:
@@ -446,7 +511,11 @@ def _members(kind: Kind[Any], module: ModuleType) -> dict[str, object]:
         name: value
         for name, value in vars(module).items()
         if isinstance(value, kind.entry)
-        or (isinstance(value, type) and issubclass(value, kind.bases) and value.__module__ == module.__name__)
+        or (
+            isinstance(value, type)
+            and issubclass(value, kind.bases)
+            and value.__module__ == module.__name__
+        )
     }
     whole = {name: value for name, value in found.items() if not inspect.isabstract(value)}
     return whole or found

@@ -24,13 +24,27 @@ from servobench.controllers.controller import Controller, ControllerEntry, Robot
 from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError, configuration_errors
-from servobench.plant.contract.settings import File, Names, Positive, Values, nested, remark, settings
+from servobench.plant.contract.settings import (
+    File,
+    Names,
+    Positive,
+    Values,
+    nested,
+    remark,
+    settings,
+)
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import NUMERIC, FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.mapping import check_roles, check_unit, count_steps, first_instant, read_mapping
+from servobench.plant.fmu.mapping import (
+    check_roles,
+    check_unit,
+    count_steps,
+    first_instant,
+    read_mapping,
+)
 from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -90,9 +104,16 @@ class FmuController(Controller):
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
         self._given = tuple(bool(names) for names in roles)
-        self._inputs = Port(self._description.select([name for names in roles for name in names], "inputs", NUMERIC))
-        self._outputs = Port(self._description.select((*mapping.outputs, *mapping.jacobian), "outputs", NUMERIC))
-        self._write, self._read = self._instance.writer(self._inputs), self._instance.reader(self._outputs)
+        self._inputs = Port(
+            self._description.select([name for names in roles for name in names], "inputs", NUMERIC)
+        )
+        self._outputs = Port(
+            self._description.select((*mapping.outputs, *mapping.jacobian), "outputs", NUMERIC)
+        )
+        self._write, self._read = (
+            self._instance.writer(self._inputs),
+            self._instance.reader(self._outputs),
+        )
         self._advance = self._instance.stepper(self._period)
         self._first = first_instant(mapping.start_time, self._description, self._period)
         self._fresh = True
@@ -101,25 +122,52 @@ class FmuController(Controller):
         """Return how many rows of the reference it takes, and refuse sizes and units that do not fit."""
         (m, n), file = self._shape, self._description.path.name
         roles = ("outputs", "features", "joints", "seen", "jacobian", "reference")
-        found = {role: self._description.select(getattr(mapping, role), role, NUMERIC) for role in roles}
-        for role, size in (("outputs", n), ("features", m), ("joints", n), ("seen", m), ("jacobian", m * n)):
+        found = {
+            role: self._description.select(getattr(mapping, role), role, NUMERIC) for role in roles
+        }
+        for role, size in (
+            ("outputs", n),
+            ("features", m),
+            ("joints", n),
+            ("seen", m),
+            ("jacobian", m * n),
+        ):
             came = total_size(found[role])
             if found[role] and came != size:
-                raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
+                raise ValueError(
+                    f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}"
+                )
         given = {role: found[role] for role in ("joints", "features", "seen", "reference")}
-        check_roles({"outputs": found["outputs"], "jacobian": found["jacobian"], **given}, given, self._description)
+        check_roles(
+            {"outputs": found["outputs"], "jacobian": found["jacobian"], **given},
+            given,
+            self._description,
+        )
         values = self._description.select(mapping.parameters, "parameters", None)
         check_roles({**given, "parameters": values}, (), self._description)
-        units = {"outputs": "rad/s", "joints": "rad", "features": feature_unit, "reference": feature_unit}
+        units = {
+            "outputs": "rad/s",
+            "joints": "rad",
+            "features": feature_unit,
+            "reference": feature_unit,
+        }
         for role, unit in units.items():
             check_unit(role, found[role], unit, any_quantity=role in ("features", "reference"))
         taken = {variable.name for variables in given.values() for variable in variables}
-        inputs = [variable.name for variable in self._description.variables if variable.causality == "input"]
+        inputs = [
+            variable.name
+            for variable in self._description.variables
+            if variable.causality == "input"
+        ]
         if idle := [name for name in inputs if name not in taken]:
-            remark(f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value")
+            remark(
+                f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value"
+            )
         usual = self._description.usual_step
         if usual is not None and count_steps(self._period, usual) != 1:
-            remark(f"{file} is meant for a period of {usual:g} s, and run.period is {self._period:g} s")
+            remark(
+                f"{file} is meant for a period of {usual:g} s, and run.period is {self._period:g} s"
+            )
         came = total_size(found["reference"])
         rows, rest = divmod(came, m)
         if rest or rows > 1 + preview:
@@ -150,7 +198,12 @@ class FmuController(Controller):
         Raises:
             FmuError: the FMU failed, or its answer is not finite.
         """
-        parts = observation.joint_position, observation.feature, observation.valid, reference[: self._rows]
+        parts = (
+            observation.joint_position,
+            observation.feature,
+            observation.valid,
+            reference[: self._rows],
+        )
         given = [np.ravel(part) for part, wanted in zip(parts, self._given, strict=True) if wanted]
         self._inputs.values[:] = np.concatenate(given)
         self._write()
@@ -159,7 +212,9 @@ class FmuController(Controller):
         velocity = self._outputs.values[: self._shape[1]].copy()
         if not np.isfinite(velocity).all():
             name = self._description.path.name
-            raise FmuError(f"{name} returned a command that is not finite at {observation.time:g} s")
+            raise FmuError(
+                f"{name} returned a command that is not finite at {observation.time:g} s"
+            )
         return Command(velocity)
 
     def estimated_jacobian(self) -> FloatArray | None:
@@ -204,19 +259,27 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
         mapping = read_mapping(ControllerMapping, path)
         how = f"as mapped by {path.name}"
 
-    return ControllerEntry(name, f"the FMU {mapping.file.name}, {how}", NoSettings, partial(_build, mapping))
+    return ControllerEntry(
+        name, f"the FMU {mapping.file.name}, {how}", NoSettings, partial(_build, mapping)
+    )
 
 
 @configuration_errors("", FmuError)
-def _build(mapping: ControllerMapping, _config: NoSettings, knowledge: RobotKnowledge) -> FmuController:
+def _build(
+    mapping: ControllerMapping, _config: NoSettings, knowledge: RobotKnowledge
+) -> FmuController:
     return FmuController(mapping, knowledge)
 
 
 def _conventional(path: Path) -> ControllerMapping:
     """Return the mapping of an FMU with the names of exported controllers; `seen` and `jacobian` may be missing."""
     description = read_description(path, extract_fmu(path))
-    names: dict[str, Any] = {role: (name,) for role, name in CONVENTION.items() if _has(description, name)}
-    lacking = [CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names]
+    names: dict[str, Any] = {
+        role: (name,) for role, name in CONVENTION.items() if _has(description, name)
+    }
+    lacking = [
+        CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names
+    ]
     if lacking:
         lack = f"{path.name} has no {', '.join(lacking)}, as exported controllers have"
         raise ValueError(f"{lack}; write a mapping of its names, such as {path.stem}.toml")

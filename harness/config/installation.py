@@ -57,7 +57,9 @@ def check_installed(modules: tuple[str, ...], user: str) -> None:
 
 
 def _line(module: str, user: str) -> str:
-    line = f"{user} needs {module}: pip install " + (f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module)
+    line = f"{user} needs {module}: pip install " + (
+        f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module
+    )
     if module == "pybullet" and has_no_wheel():
         version = ".".join(map(str, sys.version_info[:2]))
         line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"
@@ -66,17 +68,20 @@ def _line(module: str, user: str) -> str:
 
 CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
 COMMIT_DIGITS = 12  # that a reader is shown
-CHECKOUT: Final = Path(__file__).resolve().parents[2]  # folder of the checkout, if this code lies in one
+# Folder of the checkout, if this code lies in one
+CHECKOUT: Final = Path(__file__).resolve().parents[2]
 GIT_TIME: Final = 10.0  # [s] for an answer of git
-OTHER_CHECKOUT: Final = frozenset(  # variables by which a hook of git names a checkout, maybe another one
-    (
-        "GIT_DIR",
-        "GIT_WORK_TREE",
-        "GIT_INDEX_FILE",
-        "GIT_COMMON_DIR",
-        "GIT_OBJECT_DIRECTORY",
-        "GIT_NAMESPACE",
-        "GIT_PREFIX",
+OTHER_CHECKOUT: Final = (
+    frozenset(  # variables by which a hook of git names a checkout, maybe another one
+        (
+            "GIT_DIR",
+            "GIT_WORK_TREE",
+            "GIT_INDEX_FILE",
+            "GIT_COMMON_DIR",
+            "GIT_OBJECT_DIRECTORY",
+            "GIT_NAMESPACE",
+            "GIT_PREFIX",
+        )
     )
 )
 
@@ -136,7 +141,14 @@ def blas_libraries() -> list[dict[str, Any]]:
     ]
     if not found:
         blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
-        found.append({"name": blas.get("name"), "version": blas.get("version"), "threads": None, "kernel": None})
+        found.append(
+            {
+                "name": blas.get("name"),
+                "version": blas.get("version"),
+                "threads": None,
+                "kernel": None,
+            }
+        )
     return found
 
 
@@ -158,7 +170,13 @@ def _git(root: Path, *words: str) -> str:
     environment["LC_ALL"] = "C"
     try:
         answer = subprocess.run(
-            ["git", *words], cwd=root, env=environment, capture_output=True, text=True, timeout=GIT_TIME, check=True
+            ["git", *words],
+            cwd=root,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=GIT_TIME,
+            check=True,
         )
     except subprocess.CalledProcessError as error:
         said = str(error.stderr).strip().partition("\n")[0].removeprefix("fatal: ")

@@ -17,7 +17,15 @@ from typing import Any, Final, Generic, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, compose, suggest_pair
-from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, Own, own_object, read_own
+from servobench.harness.config.entries import (
+    CONTROLLER,
+    PLANT,
+    Entry,
+    Kind,
+    Own,
+    own_object,
+    read_own,
+)
 from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.source import describe_at, is_place
 from servobench.plant.bench.plant import PlantEntry
@@ -76,7 +84,9 @@ class Registry(Generic[Entry]):
 
     kind: Kind[Entry]  # of the entries
     group: str  # of the entry points by which others publish them
-    own: Mapping[str, Entry | str]  # those of this package, or their place `MODULE:NAME` where that loads slowly
+    own: Mapping[
+        str, Entry | str
+    ]  # those of this package, or their place `MODULE:NAME` where that loads slowly
     # makes the entry of a name with a meaning of its own; None for other names
     made: Callable[[str], Entry | None] = lambda _: None
     advice: Callable[[str], str] = lambda _: ""  # about an unknown name; empty for the nearest name
@@ -97,7 +107,9 @@ class Registry(Generic[Entry]):
         if made is not None:
             return made
         given = _OFFERED.get(name)
-        entry: Entry = given.entry if given is not None and given.word == self.kind.word else _load(self, name)
+        entry: Entry = (
+            given.entry if given is not None and given.word == self.kind.word else _load(self, name)
+        )
         return entry
 
     def choose(self, given: object) -> str:
@@ -118,7 +130,11 @@ class Registry(Generic[Entry]):
             if alias:
                 entry = self.kind.make_entry(self.find(given), given, alias)
                 return self.offer(Own(self.kind.word, entry, given))
-        if given not in (*_OFFERED, *self.names()) and not given.startswith(MAPPED) and is_place(given):
+        if (
+            given not in (*_OFFERED, *self.names())
+            and not given.startswith(MAPPED)
+            and is_place(given)
+        ):
             return self.offer(read_own(self.kind, given))
         self.find(given)
         return given
@@ -136,9 +152,17 @@ class Registry(Generic[Entry]):
         for registry in (PLANT_REGISTRY, CONTROLLER_REGISTRY, self):
             taken |= dict.fromkeys(registry.names(), f"a {registry.kind.word}")
         if name in taken:
-            raise ConfigurationError(f"{taken[name]} called {name!r} exists already; {_rename(own)}")
-        if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
-            raise ConfigurationError(f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}")
+            raise ConfigurationError(
+                f"{taken[name]} called {name!r} exists already; {_rename(own)}"
+            )
+        if other is not None and (other.place, other.file, other.digest) != (
+            own.place,
+            own.file,
+            own.digest,
+        ):
+            raise ConfigurationError(
+                f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}"
+            )
         _OFFERED[name] = own
         return name
 
@@ -164,7 +188,8 @@ class Registry(Generic[Entry]):
         return [(name, line) for (name, _), line in found.items()]
 
 
-_published: Final = cache(entry_points)  # of all groups: to find them takes a file of each installed distribution
+# of all groups: to find them takes a file of each installed distribution
+_published: Final = cache(entry_points)
 
 
 @cache
@@ -182,15 +207,23 @@ def _load(registry: Registry[Any], name: str) -> Any:  # noqa: ANN401 - an entry
     own, kind = registry.own.get(name), registry.kind.word
     if own is not None and not isinstance(own, str):
         return own
-    point = _points(registry.group).get(name) if own is None else EntryPoint(name, own, registry.group)
+    point = (
+        _points(registry.group).get(name) if own is None else EntryPoint(name, own, registry.group)
+    )
     if point is None:
         if Path(f"{name}.py").is_file():
-            raise ConfigurationError(f"unknown {kind} {name!r}: did you mean your file './{name}.py'?")
-        raise ConfigurationError(f"unknown {kind} {name!r}: {registry.advice(name) or suggest(name, registry.names())}")
+            raise ConfigurationError(
+                f"unknown {kind} {name!r}: did you mean your file './{name}.py'?"
+            )
+        raise ConfigurationError(
+            f"unknown {kind} {name!r}: {registry.advice(name) or suggest(name, registry.names())}"
+        )
     try:
         given = point.load()
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {describe_at(error)}") from error
+        raise ConfigurationError(
+            f"{kind} {name!r} ({point.value}) cannot be loaded: {describe_at(error)}"
+        ) from error
     if own is not None:
         return given
     with configuration_errors(f"{kind} {name!r} ({point.value}) cannot be used: "):
@@ -219,12 +252,21 @@ def _made_controller(name: str) -> ControllerEntry | None:
         return compose(law, estimator)
 
 
-PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=MAPPINGS)
+PLANT_REGISTRY: Final = Registry(
+    PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=MAPPINGS
+)
 CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
     CONTROLLER, "servobench.controllers", CONTROLLERS, _made_controller, suggest_pair, MAPPINGS
 )
-REGISTRIES: Final[Mapping[str, Registry[Any]]] = {"plant": PLANT_REGISTRY, "controller": CONTROLLER_REGISTRY}
-find_plant, choose_plant, plant_names = PLANT_REGISTRY.find, PLANT_REGISTRY.choose, PLANT_REGISTRY.names
+REGISTRIES: Final[Mapping[str, Registry[Any]]] = {
+    "plant": PLANT_REGISTRY,
+    "controller": CONTROLLER_REGISTRY,
+}
+find_plant, choose_plant, plant_names = (
+    PLANT_REGISTRY.find,
+    PLANT_REGISTRY.choose,
+    PLANT_REGISTRY.names,
+)
 find_controller, choose_controller = CONTROLLER_REGISTRY.find, CONTROLLER_REGISTRY.choose
 controller_names = CONTROLLER_REGISTRY.names
 
@@ -262,7 +304,9 @@ def is_foreign_controller(name: str) -> bool:
 
 def own_modules(plants: Iterable[str], controllers: Iterable[str]) -> tuple[str, ...]:
     """Return the modules of this package in which plants and controllers are, as far as they have one of their own."""
-    values = [PLANTS.get(name) for name in plants] + [NOT_COMPOSED.get(name) for name in controllers]
+    values = [PLANTS.get(name) for name in plants] + [
+        NOT_COMPOSED.get(name) for name in controllers
+    ]
     return tuple(value.partition(":")[0] for value in values if value is not None)
 
 
@@ -276,7 +320,9 @@ def _split_alias(given: str) -> tuple[str, str]:
 
 def _rename(own: Offer) -> str:
     if own.given:
-        return f"give yours another name, as a class of that name or in a {type(own.entry).__name__}"
+        return (
+            f"give yours another name, as a class of that name or in a {type(own.entry).__name__}"
+        )
     return f"give yours another name, such as my_{own.name.replace(':', '_')}={own.place}"
 
 

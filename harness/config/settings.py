@@ -26,7 +26,8 @@ from servobench.plant.contract.files import is_file, parse_toml, read_toml
 from servobench.plant.contract.settings import override
 
 Config = TypeVar("Config")
-MAPPED: Final = re.compile(r"\s*(fmu:.+?\.(?i:toml))\.(.+)", re.DOTALL)  # assignment to a plant called as its file
+# Assignment to a plant called as its file
+MAPPED: Final = re.compile(r"\s*(fmu:.+?\.(?i:toml))\.(.+)", re.DOTALL)
 
 
 class Assignment(NamedTuple):
@@ -60,7 +61,9 @@ class Settings:
         if not _is_section(given) or not all(_is_section(each) for each in self.sections.values()):
             wanted = "sections with keys, such as {'kinematic': {'lag': 0.1}}"
             raise ConfigurationError(f"settings must be {wanted}, got {given!r}")
-        object.__setattr__(self, "sections", {name: _undotted(each) for name, each in self.sections.items()})
+        object.__setattr__(
+            self, "sections", {name: _undotted(each) for name, each in self.sections.items()}
+        )
 
     @configuration_errors()
     def resolve(self, section: str, default: Config) -> Config:
@@ -75,7 +78,8 @@ class Settings:
 def _is_section(given: object) -> bool:
     """Return whether this is a mapping from texts, at any depth."""
     return isinstance(given, Mapping) and all(
-        isinstance(key, str) and (not isinstance(value, Mapping) or _is_section(value)) for key, value in given.items()
+        isinstance(key, str) and (not isinstance(value, Mapping) or _is_section(value))
+        for key, value in given.items()
     )
 
 
@@ -85,7 +89,9 @@ def _undotted(section: Mapping[str, Any]) -> Mapping[str, Any]:
     for key in dotted:
         whole = next((each for each in section if key.startswith(f"{each}.")), None)
         if whole is not None:
-            raise ConfigurationError(f"settings give {whole!r} and also {key!r}, a part of it; write one of them")
+            raise ConfigurationError(
+                f"settings give {whole!r} and also {key!r}, a part of it; write one of them"
+            )
     nested = {key: value for key, value in section.items() if key not in dotted}
     for key in dotted:
         _put(nested, key, section[key])
@@ -103,13 +109,17 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
         sections = read_toml("configuration file", path)
         for name, section in sections.items():
             if not isinstance(section, dict):
-                raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")
+                raise ConfigurationError(
+                    f"configuration file {path}: {name!r} stands outside a [section]"
+                )
     filed = {(name, key) for name, section in sections.items() for key in flatten(section)}
     assigned: dict[tuple[str, str], Assignment] = {}
     for text in assignments:
         new = _assign(sections, text)
         if old := assigned.get((new.section, new.key)):
-            raise ConfigurationError(f"--set gives {new.section}.{new.key} twice: {old.text} and {new.text}")
+            raise ConfigurationError(
+                f"--set gives {new.section}.{new.key} twice: {old.text} and {new.text}"
+            )
         assigned[new.section, new.key] = new
     return Settings(sections, tuple(assigned.values()), frozenset(filed - assigned.keys()))
 
@@ -117,7 +127,11 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass
     """Return the fields of a configuration dataclass, or settings by nested keys, by dotted key."""
     flat = {}
-    values = {each.name: getattr(config, each.name) for each in fields(config)} if is_dataclass(config) else config
+    values = (
+        {each.name: getattr(config, each.name) for each in fields(config)}
+        if is_dataclass(config)
+        else config
+    )
     for name, value in values.items():
         if is_dataclass(value) or (config is values and isinstance(value, Mapping)):
             flat.update(flatten(value, f"{prefix}{name}."))
@@ -151,8 +165,11 @@ def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
     if mapped:
         path.insert(0, mapped[1])
     if not equals or len(path) < 2 or not all(path):
-        raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
-    bare = text.count(",") > 1 and text.lstrip()[0] not in "[{'\""  # three numbers or more, without brackets
+        raise ConfigurationError(
+            f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}"
+        )
+    # Three numbers or more, without brackets
+    bare = text.count(",") > 1 and text.lstrip()[0] not in "[{'\""
     value: Any = text.strip()  # a bare word is a string
     if not is_file(value) or "#" not in value:  # which would begin a comment
         with contextlib.suppress(ValueError, RecursionError):
@@ -221,7 +238,9 @@ def tuned_settings(name: str) -> Mapping[str, Any]:
     try:
         values = parse_toml(file.read_text(encoding="utf-8"))["settings"]
     except (OSError, ValueError, KeyError) as error:
-        raise ConfigurationError(f"tuned values {file} cannot be read: {error}; make them with tune") from error
+        raise ConfigurationError(
+            f"tuned values {file} cannot be read: {error}; make them with tune"
+        ) from error
     if not isinstance(values, dict):
         raise ConfigurationError(f"tuned values {file}: [settings] must be a table, got {values!r}")
     return values

@@ -51,9 +51,21 @@ class SourceFile:
             path = (present_folder() / user_path(given)).resolve()
             return cls(path, path.read_text(encoding="utf-8"))
         except FileNotFoundError as error:
-            beside = [each.name for each in path.parent.glob("*.[pP][yY]")] if path.parent.is_dir() else []
-            hint = suggest(path.name, beside) if beside else f"{show(path.parent)} holds no Python file"
-            hint = "a name before = has letters, digits and _ only" if "=" in given.partition("/")[0] else hint
+            beside = (
+                [each.name for each in path.parent.glob("*.[pP][yY]")]
+                if path.parent.is_dir()
+                else []
+            )
+            hint = (
+                suggest(path.name, beside)
+                if beside
+                else f"{show(path.parent)} holds no Python file"
+            )
+            hint = (
+                "a name before = has letters, digits and _ only"
+                if "=" in given.partition("/")[0]
+                else hint
+            )
             raise ConfigurationError(f"there is no file {given}: {hint}") from error
         except (OSError, ValueError) as error:
             raise ConfigurationError(f"{given} cannot be read: {reason(error)}") from error
@@ -123,7 +135,9 @@ def present_folder() -> Path:
     try:
         return Path.cwd()
     except FileNotFoundError as error:
-        raise ConfigurationError("the present folder was deleted; change to one that exists") from error
+        raise ConfigurationError(
+            "the present folder was deleted; change to one that exists"
+        ) from error
 
 
 def check_present_folder() -> None:
@@ -166,7 +180,10 @@ def describe_at(error: BaseException) -> str:
         place, message = f"{show(Path(error.filename))}:{error.lineno}: ", error.msg
     else:
         frames = reversed(traceback.extract_tb(error.__traceback__))
-        place, message = _first_place((frame.filename, frame.lineno) for frame in frames), str(error)
+        place, message = (
+            _first_place((frame.filename, frame.lineno) for frame in frames),
+            str(error),
+        )
     return place + " ".join(f"{type(error).__name__}: {message}".split()).rstrip(":")
 
 
@@ -200,7 +217,12 @@ def is_users(file: str) -> bool:
 def _plugin_packages() -> frozenset[str]:
     """Return the top-level packages of other distributions that publish something for this package."""
     found = entry_points()
-    points = (each for group in found.groups if group.startswith(f"{PACKAGE}.") for each in found.select(group=group))
+    points = (
+        each
+        for group in found.groups
+        if group.startswith(f"{PACKAGE}.")
+        for each in found.select(group=group)
+    )
     return frozenset(point.module.partition(".")[0] for point in points) - {PACKAGE}
 
 
@@ -275,7 +297,9 @@ def neighbours(file: Path, root: Path) -> list[Path]:
         file: the file.
         root: the folder from which its imports start.
     """
-    return sorted({path for _, _, name in traced_imports(file, root) for path in _files(root, name)} - {file})
+    return sorted(
+        {path for _, _, name in traced_imports(file, root) for path in _files(root, name)} - {file}
+    )
 
 
 def traced_imports(file: Path, root: Path) -> Iterator[tuple[Path, int, Name]]:

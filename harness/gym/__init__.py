@@ -16,7 +16,11 @@ def register() -> None:
     """Make the environment known to `gymnasium.make` and `make_vec`; once is enough."""
     if ENVIRONMENT not in gymnasium.registry:
         place = "servobench.harness.gym.environment"
-        gymnasium.register(ENVIRONMENT, entry_point=f"{place}:ServoEnv", vector_entry_point=f"{place}:ServoVectorEnv")
+        gymnasium.register(
+            ENVIRONMENT,
+            entry_point=f"{place}:ServoEnv",
+            vector_entry_point=f"{place}:ServoVectorEnv",
+        )
 
 
 @final

@@ -15,10 +15,22 @@ from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, check_possible
+from servobench.harness.run.experiment import (
+    Drawn,
+    Experiment,
+    build,
+    build_together,
+    check_possible,
+)
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, find_robot, read_mismatch, read_seed
+from servobench.harness.run.request import (
+    DEFAULT_ROBOT,
+    RunRequest,
+    find_robot,
+    read_mismatch,
+    read_seed,
+)
 from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -65,7 +77,10 @@ class Spaces:
 
     def command(self, action: npt.ArrayLike) -> FloatArray:
         """Return joint velocities, (..., n) rad/s, for an action, (..., n) shares of the limits; clipped to them."""
-        return np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) * self.spec.joint_velocity_limit
+        return (
+            np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+            * self.spec.joint_velocity_limit
+        )
 
     def action(self, given: npt.ArrayLike, *lanes: int) -> FloatArray:
         """Return an action as an array, (*lanes, n).
@@ -81,7 +96,9 @@ class Spaces:
             raise ValueError(f"action must be an array of numbers, got {given!r}")
         return as_array("action", numbers, (*lanes, self.spec.n))
 
-    def observe(self, observation: Observation, reference: FloatArray, action: npt.ArrayLike) -> Floats32:
+    def observe(
+        self, observation: Observation, reference: FloatArray, action: npt.ArrayLike
+    ) -> Floats32:
         """Return the policy's observation.
 
         Args:
@@ -105,14 +122,18 @@ class Spaces:
 
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none
-PLACEHOLDER: Final = "constant"  # the harness builds every run with a controller; this one costs least
+PLACEHOLDER: Final = (
+    "constant"  # the harness builds every run with a controller; this one costs least
+)
 MARK: Final = (40, 40, 40)  # red, green, blue
 
 
 def check_options(options: object) -> None:
     """Raise a `ConfigurationError` if `reset` is given options: there are none."""
     if options not in (None, {}):
-        raise ConfigurationError(f"reset has no options, got {options!r}; make another environment for another choice")
+        raise ConfigurationError(
+            f"reset has no options, got {options!r}; make another environment for another choice"
+        )
 
 
 def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
@@ -166,7 +187,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigurationError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         self.render_mode = render_mode
-        request = RunRequest(plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing)
+        request = RunRequest(
+            plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing
+        )
         given = Settings({} if settings is None else settings)
         check_settings(given, [plant, task])
         self.resolved: Final = resolve(request, given)
@@ -230,7 +253,10 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         except RunFault as fault:
             spec, start = self._spaces.spec, experiment.scenario.start
             start = np.zeros(spec.n) if start is None else start
-            observation, self._fault = Observation(0.0, start, np.zeros(spec.m), feature_valid=False), fault
+            observation, self._fault = (
+                Observation(0.0, start, np.zeros(spec.m), feature_valid=False),
+                fault,
+            )
             info["reason"] = str(fault)
         self._rollout = Rollout(experiment.plant, observation, desired, experiment.loop)
         return self._observe(self._rollout), info
@@ -251,7 +277,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         """
         experiment, rollout, reason = self._experiment, self._rollout, None
         if experiment is None or rollout is None or self._over:
-            raise gymnasium.error.ResetNeeded("call reset before step: no episode has begun, or it is over")
+            raise gymnasium.error.ResetNeeded(
+                "call reset before step: no episode has begun, or it is over"
+            )
         self._action = self._spaces.action(action)
         try:
             if self._fault is not None:
@@ -294,7 +322,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             self._outside = OutsideScene(experiment.drawn, self.resolved.request)
         move = experiment.loop.camera_move
         moved = move is not None and rollout.k > move.period
-        return self._outside.picture(rollout.observation.joint_position, rollout.reference[0], moved=moved)
+        return self._outside.picture(
+            rollout.observation.joint_position, rollout.reference[0], moved=moved
+        )
 
     def close(self) -> None:
         """Free the plant; calling it twice is allowed."""
@@ -316,10 +346,18 @@ class OutsideScene:
             ConfigurationError: the plant brings a robot of its own, or no engine that renders is installed.
         """
         if drawn.true is None:
-            raise ConfigurationError(f"plant {request.plant} brings a robot of its own, which cannot be rendered")
+            raise ConfigurationError(
+                f"plant {request.plant} brings a robot of its own, which cannot be rendered"
+            )
         robot = find_robot(request.robot)
-        self._arm, self._drawn, self._overview = drawn.true.arm, drawn, Overview.of(robot.workspace.scale)
-        self._scene = load_engine(rendered_plant()).scene(Room(self._arm, scenery=True, robot=robot))
+        self._arm, self._drawn, self._overview = (
+            drawn.true.arm,
+            drawn,
+            Overview.of(robot.workspace.scale),
+        )
+        self._scene = load_engine(rendered_plant()).scene(
+            Room(self._arm, scenery=True, robot=robot)
+        )
 
     def picture(self, joint_position: FloatArray, target: FloatArray, *, moved: bool) -> ByteArray:
         """Return the arm, (480, 640, 3), with a cross where features are places and the ball is to be.
@@ -378,22 +416,34 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ConfigurationError(f"num_envs must be a whole number from 1 on, got {num_envs!r}")
         if choice.get("render_mode") is not None:
-            raise ConfigurationError("runs side by side are not rendered; leave render_mode out, or use gymnasium.make")
+            raise ConfigurationError(
+                "runs side by side are not rendered; leave render_mode out, or use gymnasium.make"
+            )
         single = ServoEnv(**choice)
         self._resolved = single.resolved
         if max_episode_steps not in (None, single.periods):
             wanted = f"max_episode_steps must be {single.periods}, as the task has so many periods"
-            raise ConfigurationError(f"{wanted}, got {max_episode_steps}; settings= may change its duration")
+            raise ConfigurationError(
+                f"{wanted}, got {max_episode_steps}; settings= may change its duration"
+            )
         if side_by_side_key(self._resolved) is None:
             alone = f"plant {self._resolved.request.plant} carries out one run at a time"
-            raise ConfigurationError(f"{alone}: gymnasium.make_vec(..., vectorization_mode='async')")
+            raise ConfigurationError(
+                f"{alone}: gymnasium.make_vec(..., vectorization_mode='async')"
+            )
         self.num_envs = int(num_envs)
-        self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
+        self.single_observation_space, self.single_action_space = (
+            single.observation_space,
+            single.action_space,
+        )
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Floats32, dict[str, Any]]:
         """Begin a run in every lane.
 
@@ -413,26 +463,37 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         if isinstance(seed, list | tuple | np.ndarray):
             listed = [None if each is None else read_seed(each) for each in seed]
         if listed is not None and len(listed) != count:
-            raise ConfigurationError(f"seed must be a number or a list of {count}, got {len(listed)} seeds")
+            raise ConfigurationError(
+                f"seed must be a number or a list of {count}, got {len(listed)} seeds"
+            )
         first = cast("int | None", seed if listed is None else listed[0])
         super().reset(seed=first)
         if listed is None and first is not None and read_seed(first) > 2**63 - count:
             raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {first}")
-        seeds = self.np_random.integers(SEEDS, size=count) if first is None or listed else first + np.arange(count)
+        seeds = (
+            self.np_random.integers(SEEDS, size=count)
+            if first is None or listed
+            else first + np.arange(count)
+        )
         if listed is not None:
             pairs = zip(listed, seeds.tolist(), strict=True)
             seeds = np.array([drawn if each is None else each for each, drawn in pairs])
         self.close_extras()
-        self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
+        self._many = many = build_together(
+            [with_seed(self._resolved, each) for each in seeds.tolist()]
+        )
         bench = self._bench = cast(Bench, many.plant)
         self._spaces = Spaces(bench.spec, many.loop.preview)
         self._ended = False
         self._action: FloatArray = np.zeros((self.num_envs, bench.spec.n))
         observation = bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
-        self._rollout = Rollout(bench, observation, many.desired(many.periods + 1), many.loop)  # also after the last
+        # Also after the last
+        self._rollout = Rollout(bench, observation, many.desired(many.periods + 1), many.loop)
         return self._observe(), {"seed": seeds}
 
-    def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+    def step(
+        self, actions: npt.ArrayLike
+    ) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Hold an action in every lane for a period; see `ServoEnv.step`, but without `reason`.
 
         Args:
@@ -468,7 +529,9 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         return None if self._many is None else self._rollout.observation
 
     def _observe(self) -> Floats32:
-        return self._spaces.observe(self._rollout.observation, self._rollout.reference, self._action)
+        return self._spaces.observe(
+            self._rollout.observation, self._rollout.reference, self._action
+        )
 
     def close_extras(self, **_options: Any) -> None:  # noqa: ANN401 - Gymnasium's
         """Free the plant."""

@@ -12,7 +12,12 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.folder import titled_runs
-from servobench.harness.pictures.measures import FIGURES, draw_conditions, draw_measures, draw_step_times
+from servobench.harness.pictures.measures import (
+    FIGURES,
+    draw_conditions,
+    draw_measures,
+    draw_step_times,
+)
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import (
     draw_features,
@@ -32,7 +37,14 @@ from servobench.harness.pictures.style import (
     method_styles,
     save_figure,
 )
-from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles, load_groups, longest, shown_until
+from servobench.harness.pictures.tracks import (
+    Ensembles,
+    Group,
+    load_ensembles,
+    load_groups,
+    longest,
+    shown_until,
+)
 from servobench.harness.run.request import UNFIT_FOR_FILES
 
 FOLDER = "figures"
@@ -50,7 +62,10 @@ class Kind(NamedTuple):
 
 
 KINDS: Final = {
-    "conditions": Kind("Settled moves over each varied condition, all others together; bands are 95 % intervals", EACH),
+    "conditions": Kind(
+        "Settled moves over each varied condition, all others together; bands are 95 % intervals",
+        EACH,
+    ),
     "errors": Kind("Error of moves over time", OVER),
     "features": Kind("Measured features of moves", FIRST, in_page=False),
     "paths": Kind("True paths of moves, to scale", FIRST),
@@ -80,7 +95,9 @@ class Choice:
     """The figures that are wanted of a folder, and their appearance."""
 
     kinds: Collection[str] = tuple(KINDS)  # some of KINDS
-    names: Mapping[str, str] | None = None  # controllers that are shown, with their names in the figures; None for all
+    names: Mapping[str, str] | None = (
+        None  # controllers that are shown, with their names in the figures; None for all
+    )
     layout: Layout = WIDE  # of the figures; a narrow one shows tasks one by one
     title: bool = True  # whether the figures have titles
 
@@ -92,7 +109,11 @@ def draw_figures(folder: Path) -> list[Path]:
         ConfigurationError: not a results folder.
     """
     figures = folder_figures(folder)
-    return [path for named in figures for path in save_figure(named.figure, folder / FOLDER / named.stem, ("png",))]
+    return [
+        path
+        for named in figures
+        for path in save_figure(named.figure, folder / FOLDER / named.stem, ("png",))
+    ]
 
 
 def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFigure]:
@@ -109,11 +130,15 @@ def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFig
         styles = {shown: styles[name] for name, shown in choice.names.items()}
     size = TASKS_A_FIGURE if choice.layout.wide else 1
     for group, plan in _folder_plans(folder, runs, styles, size):
-        if plan.kind in choice.kinds and (named := _carry_out(group, plan, choice.layout, title=choice.title)):
+        if plan.kind in choice.kinds and (
+            named := _carry_out(group, plan, choice.layout, title=choice.title)
+        ):
             yield named
 
 
-def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
+def page_figures(
+    folder: Path, runs: pd.DataFrame, kinds: Collection[str]
+) -> Iterator[tuple[NamedFigure, NamedFigure]]:
     """Yield the figures of some kinds (keys of `KINDS`) for a page, each wide and narrow; tasks one by one.
 
     Raises:
@@ -121,7 +146,9 @@ def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> It
     """
     for group, plan in _folder_plans(folder, runs, method_styles(runs["controller"].tolist()), 1):
         if plan.kind in kinds:
-            wide, narrow = (_carry_out(group, plan, layout, title=False) for layout in (WIDE, NARROW))
+            wide, narrow = (
+                _carry_out(group, plan, layout, title=False) for layout in (WIDE, NARROW)
+            )
             if wide is not None and narrow is not None:
                 yield wide, narrow
 
@@ -135,11 +162,16 @@ class _Plan(NamedTuple):
     draw: Callable[[Layout], Figure | None]
 
 
-def _folder_plans(folder: Path, runs: pd.DataFrame, styles: Styles, size: int) -> Iterator[tuple[Group, _Plan]]:
+def _folder_plans(
+    folder: Path, runs: pd.DataFrame, styles: Styles, size: int
+) -> Iterator[tuple[Group, _Plan]]:
     """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
     if len(runs) > 1:
         everything = Group("", "", runs, int(runs["seed"].min()), {})
-        yield everything, _Plan("conditions", "", (), partial(draw_conditions, split_tasks(runs)[0], styles))
+        yield (
+            everything,
+            _Plan("conditions", "", (), partial(draw_conditions, split_tasks(runs)[0], styles)),
+        )
     for group in load_groups(folder, runs):
         for plan in _plans(group, load_ensembles(folder, group.runs), styles, size):
             yield group, plan
@@ -147,17 +179,25 @@ def _folder_plans(folder: Path, runs: pd.DataFrame, styles: Styles, size: int) -
 
 def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> NamedFigure | None:
     """Return a figure with its name and heading."""
-    heading, place = KINDS[plan.kind].heading, f"{group.plant}, mismatch {group.mismatch}" if group.plant else ""
+    heading, place = (
+        KINDS[plan.kind].heading,
+        f"{group.plant}, mismatch {group.mismatch}" if group.plant else "",
+    )
     details = ", ".join(filter(None, (plan.part, place, _sample(plan.kind, group))))
     with figure_style(TEXT):
         figure = plan.draw(layout)
         if figure is None:
             return None
         if title:
-            wrapped = (textwrap.fill(text, round(LETTERS * figure.get_figwidth())) for text in (heading, details))
+            wrapped = (
+                textwrap.fill(text, round(LETTERS * figure.get_figwidth()))
+                for text in (heading, details)
+            )
             figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
     words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
-    return NamedFigure(plan.kind, UNFIT_FOR_FILES.sub("_", words), f"{heading}: {details}", plan.tasks, figure)
+    return NamedFigure(
+        plan.kind, UNFIT_FOR_FILES.sub("_", words), f"{heading}: {details}", plan.tasks, figure
+    )
 
 
 def _sample(kind: str, group: Group) -> str:
@@ -165,7 +205,8 @@ def _sample(kind: str, group: Group) -> str:
     seeds, how = group.runs["seed"].nunique(), KINDS[kind].seeds
     if how == FIRST or seeds == 1:
         return f"seed {group.seed}"
-    least = int(group.runs.groupby(["controller", "task"])["seed"].nunique().min())  # of an unfinished batch
+    # of an unfinished batch
+    least = int(group.runs.groupby(["controller", "task"])["seed"].nunique().min())
     count = f"{least} to {seeds} seeds" if least < seeds else f"{seeds} seeds"
     if how == EACH:
         return count
@@ -173,20 +214,36 @@ def _sample(kind: str, group: Group) -> str:
     return f"{words}; errors in features of seed {group.seed}" if kind == "tracking" else words
 
 
-def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
+def _plans(
+    group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int
+) -> Iterator[_Plan]:
     """Yield the figures of a group: of its moves, of its curves, and of both."""
     moves = {task: tracks for task, tracks in group.tasks.items() if longest(tracks).point_to_point}
     runs, everything = group.runs, tuple(group.tasks)
     until = {task: shown_until(ensembles[task]) for task in everything}
     for text, part in _parts(moves, size):
-        yield _Plan("errors", text, part, partial(draw_moves, {task: ensembles[task] for task in part}, styles))
-        yield _Plan("features", text, part, partial(draw_features, {task: moves[task] for task in part}, until, styles))
+        yield _Plan(
+            "errors",
+            text,
+            part,
+            partial(draw_moves, {task: ensembles[task] for task in part}, styles),
+        )
+        yield _Plan(
+            "features",
+            text,
+            part,
+            partial(draw_features, {task: moves[task] for task in part}, until, styles),
+        )
     heads = divisions(name for tracks in moves.values() for name in tracks)
     for text, part in _parts(moves, max(1, size // len(heads))):
-        yield _Plan("paths", text, part, partial(draw_paths, {task: moves[task] for task in part}, styles))
+        yield _Plan(
+            "paths", text, part, partial(draw_paths, {task: moves[task] for task in part}, styles)
+        )
     for task, tracks in group.tasks.items():
         if task not in moves:
-            yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
+            yield _Plan(
+                "tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles)
+            )
             yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all

@@ -25,7 +25,12 @@ from servobench.harness.analysis.comparison import FROM_TWIN
 from servobench.harness.config.installation import missing_extra
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.responses import mark_settling_band
-from servobench.harness.pictures.style import figure_style, method_styles, plain_logarithms, save_figure
+from servobench.harness.pictures.style import (
+    figure_style,
+    method_styles,
+    plain_logarithms,
+    save_figure,
+)
 from servobench.harness.run.request import DEFAULT_ROBOT, short_name
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -34,7 +39,8 @@ from servobench.plant.robot.workspace import BALL_RADIUS
 
 MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
 WIDTH, HEIGHT = 960, 816  # px of a frame; ffmpeg wants multiples of 16
-HEAD, VIEW_WIDTH, VIEW_HEIGHT = 48, 640, 480  # px: line of text on top, overview below it at the left
+# Px: line of text on top, overview below it at the left
+HEAD, VIEW_WIDTH, VIEW_HEIGHT = (48, 640, 480)
 TYPE = 19.0  # [pt] of all words: 9 px high where a page on a telephone shows the frame 330 px wide
 SIDE = WIDTH - VIEW_WIDTH
 CAMERA_HEIGHT = 240  # px
@@ -42,14 +48,18 @@ MAX_RATE = 25.0  # frames a second
 FINENESS = 1.25  # pixels rendered for one pixel of the overview, along each side
 REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
 SNAPSHOT_COUNT = 8
-MIN_ADVANCE = 0.01  # of the extent of the ball's path: shorter ways are the jitter of an arm at rest
+MIN_ADVANCE = (
+    0.01  # of the extent of the ball's path: shorter ways are the jitter of an arm at rest
+)
 CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: larger than the ball
 CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
 GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
 QUALITY = "22"  # of H.264: smaller is better and larger
 
 
-def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:
+def write_recording(
+    run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress
+) -> list[Path]:
     """Write the recordings of a run that are named in `kinds` into one folder, and return the files.
 
     Args:
@@ -74,10 +84,13 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
     stem.parent.mkdir(parents=True, exist_ok=True)
     board, time = _Board(run), run.track.time
     count, period = len(time), float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    step = max(1, round(1.0 / (MAX_RATE * period)))  # periods from frame to frame; the film lasts as long as the run
+    # Periods from frame to frame; the film lasts as long as the run
+    step = max(1, round(1.0 / (MAX_RATE * period)))
     rate = 1.0 / (step * period)
     with ExitStack() as stack:
-        writers = [stack.enter_context(encoding(ffmpeg, film, (WIDTH, HEIGHT), rate)) for film in films]
+        writers = [
+            stack.enter_context(encoding(ffmpeg, film, (WIDTH, HEIGHT), rate)) for film in films
+        ]
         replay = stack.enter_context(Replay(run, fineness=FINENESS))
         for k in range(0, count, step):
             progress(k / count, "frames")
@@ -105,7 +118,9 @@ def find_ffmpeg() -> str:
 
 
 @contextmanager
-def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Iterator[Callable[[ByteArray], None]]:
+def encoding(
+    ffmpeg: str, path: Path, size: tuple[int, int], rate: float
+) -> Iterator[Callable[[ByteArray], None]]:
     """Yield a function that appends a frame (height, width, 3) to the film `path`, complete when the context ends.
 
     Args:
@@ -118,11 +133,34 @@ def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Ite
         ConfigurationError: ffmpeg cannot write the film; with its last line.
     """
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{rate:g}", "-i", "-"]
-    call = [ffmpeg, "-y", "-v", "error", *raw, *_options(path.suffix.removeprefix("."), rate), str(partial)]
+    raw = [
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{size[0]}x{size[1]}",
+        "-r",
+        f"{rate:g}",
+        "-i",
+        "-",
+    ]
+    call = [
+        ffmpeg,
+        "-y",
+        "-v",
+        "error",
+        *raw,
+        *_options(path.suffix.removeprefix("."), rate),
+        str(partial),
+    ]
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
-            call, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=complaints, start_new_session=True
+            call,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=complaints,
+            start_new_session=True,
         )
         pipe = cast("IO[bytes]", process.stdin)
 
@@ -158,12 +196,16 @@ def _options(kind: str, rate: float) -> list[str]:
     return ["-filter_complex", chain, "-c:v", "gif"]
 
 
-def _failure(path: Path, process: subprocess.Popen[bytes], complaints: IO[bytes]) -> ConfigurationError:
+def _failure(
+    path: Path, process: subprocess.Popen[bytes], complaints: IO[bytes]
+) -> ConfigurationError:
     """Return the error of a failed call of ffmpeg, with the last line of its output."""
     code = process.wait()
     complaints.seek(0)
     last = complaints.read().decode(errors="replace").rstrip().rpartition("\n")[2].strip()
-    return ConfigurationError(f"ffmpeg cannot write {path}: {last or f'it ended with exit code {code}'}")
+    return ConfigurationError(
+        f"ffmpeg cannot write {path}: {last or f'it ended with exit code {code}'}"
+    )
 
 
 def draw_snapshots(run: LoggedRun) -> Figure:
@@ -173,7 +215,9 @@ def draw_snapshots(run: LoggedRun) -> Figure:
     for axes in panels:
         axes.set_axis_off()
     with Replay(run, fineness=2.0) as replay:
-        for axes, k in zip(panels, snapshot_instants(run.ball[: _lap(run) + 1], SNAPSHOT_COUNT), strict=False):
+        for axes, k in zip(
+            panels, snapshot_instants(run.ball[: _lap(run) + 1], SNAPSHOT_COUNT), strict=False
+        ):
             replay.place(k)
             axes.imshow(replay.overview(_trails(run, k)), interpolation="antialiased")
             axes.set_title(f"{run.track.time[k]:.2f} s")
@@ -195,14 +239,23 @@ class _Board:
         with figure_style():
             self._figure = figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
             self._canvas = cast("Any", FigureCanvasAgg(figure))
-            title = figure.text(0.01, 1 - HEAD / 2 / HEIGHT, _title(run), va="center", fontsize=TYPE, fontweight="bold")
+            title = figure.text(
+                0.01,
+                1 - HEAD / 2 / HEIGHT,
+                _title(run),
+                va="center",
+                fontsize=TYPE,
+                fontweight="bold",
+            )
             title.set_fontsize(TYPE * min(1.0, 0.98 * WIDTH / title.get_window_extent().width))
             self._axes = figure.add_axes((0.11, 0.1, 0.865, 0.225))
             self._prepare_axes()
             left, top = VIEW_WIDTH / WIDTH + 0.02, 1 - (HEAD + CAMERA_HEIGHT + 10) / HEIGHT
             below: dict[str, Any] = {"fontsize": TYPE, "va": "top"}
             figure.text(left, top, "the camera's view", **below)
-            self._numbers = figure.text(left, top - 0.06, "", family="monospace", animated=True, **below)
+            self._numbers = figure.text(
+                left, top - 0.06, "", family="monospace", animated=True, **below
+            )
             lines = [
                 mpl.lines.Line2D([], [], color=self._colour, linewidth=3, label="ball, so far"),
                 mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label=_desired(run)),
@@ -222,11 +275,17 @@ class _Board:
         time = run.track.time
         self._line.set_data(time[: k + 1], self._error[: k + 1])
         self._now.set_data(time[k : k + 1], self._error[k : k + 1])
-        self._numbers.set_text(f"time {time[k]:6.2f} s\nerror {self._error[k]:5.1f} {run.track.error_unit[0]}")
+        self._numbers.set_text(
+            f"time {time[k]:6.2f} s\nerror {self._error[k]:5.1f} {run.track.error_unit[0]}"
+        )
         for artist in (self._line, self._now, self._numbers):
             self._figure.draw_artist(artist)
         frame: ByteArray = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-        view = cv2.resize(replay.overview(_trails(run, k)), (VIEW_WIDTH, VIEW_HEIGHT), interpolation=cv2.INTER_AREA)
+        view = cv2.resize(
+            replay.overview(_trails(run, k)),
+            (VIEW_WIDTH, VIEW_HEIGHT),
+            interpolation=cv2.INTER_AREA,
+        )
         frame[HEAD : HEAD + VIEW_HEIGHT, :VIEW_WIDTH] = view
         raw = replay.camera_view()
         scale = min(SIDE / raw.shape[1], CAMERA_HEIGHT / raw.shape[0])
@@ -239,7 +298,9 @@ class _Board:
         positive = self._error[np.isfinite(self._error) & (self._error > 0.0)]
         if len(positive):
             plain_logarithms(axes)
-            axes.set_ylim(np.fmin(0.8 * positive.min(), 0.6 * band), 1.3 * np.fmax(positive.max(), band))
+            axes.set_ylim(
+                np.fmin(0.8 * positive.min(), 0.6 * band), 1.3 * np.fmax(positive.max(), band)
+            )
         axes.set_xlim(track.time[0], max(float(track.time[-1]), track.time[0] + 1e-3))
         mark_settling_band(axes, track)
         for line in axes.get_lines():
@@ -249,7 +310,9 @@ class _Board:
         axes.set_xlabel("time [s]", fontsize=TYPE)
         axes.set_ylabel(f"error [{track.error_unit[0]}]", fontsize=TYPE)
         (self._line,) = axes.plot([], [], color=self._colour, linewidth=1.8, animated=True)
-        (self._now,) = axes.plot([], [], color=self._colour, marker="o", markersize=6, animated=True)
+        (self._now,) = axes.plot(
+            [], [], color=self._colour, marker="o", markersize=6, animated=True
+        )
 
 
 def _colour(run: LoggedRun) -> str:
@@ -260,10 +323,15 @@ def _colour(run: LoggedRun) -> str:
 def _trails(run: LoggedRun, k: int) -> list[Trail]:
     """Return the desired path, or a cross at a fixed target, and the ball's path up to period `k`."""
     red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(_colour(run)))
-    desired = run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
+    desired = (
+        run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
+    )
     cross = [desired[0] + np.stack([-arm, arm]) for arm in CROSS * np.eye(3)]
     lines = cross if run.track.point_to_point else [desired]
-    return [*(Trail(line, REFERENCE_COLOUR, 2) for line in lines), Trail(run.ball[: k + 1], (red, green, blue), 3)]
+    return [
+        *(Trail(line, REFERENCE_COLOUR, 2) for line in lines),
+        Trail(run.ball[: k + 1], (red, green, blue), 3),
+    ]
 
 
 def _desired(run: LoggedRun) -> str:

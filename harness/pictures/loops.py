@@ -28,7 +28,8 @@ PAGE, TEMPLATE = "analyse.html", "loops.html"
 FIGURES = "figures"
 LATENCIES: FloatArray = np.linspace(0.0, 0.5, 21)  # [s]
 FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # on the command
-PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)  # M_s at the edges of the colours; above 2 a loop is hardly robust
+# M_s at the edges of the colours; above 2 a loop is hardly robust
+PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)
 NYQUIST_REACH = 2.5  # of the axes
 COLUMNS = 3
 
@@ -50,13 +51,22 @@ def draw_loops(loops: Sequence[LoopAnalysis]) -> Figure:
         time = np.arange(len(loop.step)) * loop.arm.period
         for curve in loop.step.T if loop.stable else ():
             step.plot(time, curve, **style.line_arguments(len(time)))
-        limits.plot(1000.0 * LATENCIES, loop.gain_limits(LATENCIES.tolist()), **style.line_arguments(len(LATENCIES)))
+        limits.plot(
+            1000.0 * LATENCIES,
+            loop.gain_limits(LATENCIES.tolist()),
+            **style.line_arguments(len(LATENCIES)),
+        )
     _finish_frequencies(magnitude, phase, peaks)
     _finish_nyquist(nyquist)
     step.set(title="Step of the reference", xlabel="time [s]", ylabel="feature", ylim=(-0.05, 1.6))
     limits.axhline(1.0, color="0.4", linewidth=0.9)
     limits.axvline(1000.0 * loops[0].arm.latency, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
-    limits.set(title="Gain margin", xlabel="latency of the camera [ms]", ylabel="factor on command", ylim=(0.3, 20.0))
+    limits.set(
+        title="Gain margin",
+        xlabel="latency of the camera [ms]",
+        ylabel="factor on command",
+        ylim=(0.3, 20.0),
+    )
     plain_logarithms(limits)
     add_legend(figure, [magnitude])
     return figure
@@ -91,7 +101,9 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
     return figure
 
 
-def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFrame, legend: str) -> list[Path]:
+def write_pictures(
+    folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFrame, legend: str
+) -> list[Path]:
     """Write the pictures of at least one loop as PNG and PDF, and a page of them with their table and its legend.
 
     Returns:
@@ -99,10 +111,18 @@ def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFr
     """
     with figure_style():
         figures = {"loops": draw_loops(loops), "stability_map": draw_stability_map(loops)}
-    paths = [path for name, figure in figures.items() for path in save_figure(figure, folder / FIGURES / name)]
+    paths = [
+        path
+        for name, figure in figures.items()
+        for path in save_figure(figure, folder / FIGURES / name)
+    ]
     drawings = {name: drawing_of(figure)._asdict() for name, figure in figures.items()}
     text = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8")).substitute(
-        {f"{name}_{key}": value for name, drawing in drawings.items() for key, value in drawing.items()},
+        {
+            f"{name}_{key}": value
+            for name, drawing in drawings.items()
+            for key, value in drawing.items()
+        },
         table=table.rename(columns=one_line).to_html(index=False, border=0),
         legend=escape(legend),
     )
@@ -128,9 +148,16 @@ def _finish_frequencies(magnitude: Axes, phase: Axes, peaks: Axes) -> None:
     magnitude.set(title="Open loop L", ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
     magnitude.axhline(1.0, color="0.4", linewidth=0.9)
     plain_logarithms(magnitude)
-    phase.set(title="Open loop L", ylabel="phase of the loci of L [°]", ylim=(-540.0, 0.0), yticks=range(-540, 1, 90))
+    phase.set(
+        title="Open loop L",
+        ylabel="phase of the loci of L [°]",
+        ylim=(-540.0, 0.0),
+        yticks=range(-540, 1, 90),
+    )
     phase.axhline(-180.0, color="0.4", linewidth=0.9)
-    peaks.set(title="Sensitivity S = (I + L)⁻¹", ylabel="largest singular value of S", ylim=(0.03, 5.0))
+    peaks.set(
+        title="Sensitivity S = (I + L)⁻¹", ylabel="largest singular value of S", ylim=(0.03, 5.0)
+    )
     plain_logarithms(peaks)
 
 

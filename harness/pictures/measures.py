@@ -36,8 +36,10 @@ from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
-SETTLING, NEVER = "settling_time_s", 1.3  # and where a run without a value stands, over the largest value
-FIGURES: Final = ("settling", "effort", "smoothness")  # of which each shows the metrics that name it
+# And where a run without a value stands, over the largest value
+SETTLING, NEVER = ("settling_time_s", 1.3)
+# of which each shows the metrics that name it
+FIGURES: Final = ("settling", "effort", "smoothness")
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
@@ -46,14 +48,18 @@ NAME_LETTERS: Final = 20  # of a controller's name at an axis, for each column o
 LETTERS: Final = 16.0  # of a label in an inch
 NUMBERS: Final = 0.25  # [in] next to the names
 LEAST_ROWS: Final = 4  # controllers for which a panel has room
-SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
+SPREAD = (
+    0.5  # share of the distance between two places over which the marks of the methods are spread
+)
 UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
 LINE_LETTERS: Final = 30  # of a line of text within a panel
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 
 
-def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE) -> Figure | None:
+def draw_measures(
+    runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE
+) -> Figure | None:
     """Draw metrics of every run, a column a task, a row a metric, a line a controller; None without values.
 
     The metrics of a single task stand in one row, on a narrow sheet in one column.
@@ -61,11 +67,19 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     A bar is the median over runs. Runs that never settled stand at the right edge and are counted there. `kind` is one
     of `FIGURES`; of its metrics those without any value are left out. A narrow layout is for a single task.
     """
-    rows = [name for name, each in METRICS.items() if each.figure == kind and name in runs and runs[name].notna().any()]
+    rows = [
+        name
+        for name, each in METRICS.items()
+        if each.figure == kind and name in runs and runs[name].notna().any()
+    ]
     if not rows:
         return None
     alone = runs["task"].nunique() == 1
-    figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles, layout)
+    figure = (
+        _draw_one_task(runs, rows, styles, layout)
+        if alone
+        else _draw_each_task(runs, rows, styles, layout)
+    )
     notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
     notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
     if _never(runs, rows[0]).any():
@@ -99,7 +113,9 @@ def _draw_one_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout: 
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
     letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
     words = [textwrap.fill(_label(row, runs), letters) for row in rows]
-    height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
+    height = 0.4 + LINE * (
+        max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names))
+    )
     figure, panels = panel_grid(len(rows), height, layout, head=0.35)
     for axes, row, label in zip(panels, rows, words, strict=True):
         _draw_dots(axes, runs, names, styles, row)
@@ -119,19 +135,25 @@ def _short_name(name: str, layout: Layout) -> str:
     return name if len(name) <= letters else f"…{name[1 - letters :]}"
 
 
-def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+def draw_step_times(
+    tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE
+) -> Figure | None:
     """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values.
 
     Steps that take longer than the control period are marked and, on a wide sheet, counted.
     """
     names = list(dict.fromkeys(name for ensembles in tasks.values() for name in ensembles))
-    times = {name: 1e-3 * np.concatenate([e[name].step_time for e in tasks.values() if name in e]) for name in names}
+    times = {
+        name: 1e-3 * np.concatenate([e[name].step_time for e in tasks.values() if name in e])
+        for name in names
+    }
     known = {name: values for name, values in times.items() if len(values)}
     if not known:
         return None
     periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
     limit = 1e3 * max([period for period in periods if math.isfinite(period)], default=math.nan)
-    inside = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.98, 1.0))  # fine pictures have slightly wider bold letters
+    # Fine pictures have slightly wider bold letters
+    inside = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.98, 1.0))
     figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout=inside)
     axes = figure.add_subplot()
     top = 1.4 * max(float(np.max(values)) for values in known.values())
@@ -140,13 +162,20 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
         if layout.wide:
             axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
                           fontweight="bold" if "\n" in words else None, linespacing=1.0)  # fmt: skip
-    above: dict[str, Any] = {"va": "bottom", "fontsize": TEXT - 0.5, "xytext": (0, 2), "textcoords": "offset points"}
+    above: dict[str, Any] = {
+        "va": "bottom",
+        "fontsize": TEXT - 0.5,
+        "xytext": (0, 2),
+        "textcoords": "offset points",
+    }
     if layout.wide:
         axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", **above)
     if math.isfinite(limit):
         top = max(top, 1.6 * limit)
         axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
-        axes.axvspan(limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0)
+        axes.axvspan(
+            limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0
+        )
         words = f"control period, {limit:g} ms"
         axes.annotate(words, (limit, 1.0), xycoords=("data", "axes fraction"), ha="right", **above)
     plain_logarithms(axes, "x")
@@ -160,10 +189,15 @@ def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: Met
     """Draw the times of a controller's steps [ms] in line `i`, and return the numbers that belong beside it."""
     low, first, middle, third, high = np.percentile(values, PERCENTILES)
     axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=7)
-    axes.plot([first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45)
+    axes.plot(
+        [first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45
+    )
     axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
               markerfacecolor=style.face)  # fmt: skip
-    shown = [f"{1e3 * time:.0f} µs" if time < 0.9995 else f"{time:.3g} ms" for time in (middle, high, values.max())]
+    shown = [
+        f"{1e3 * time:.0f} µs" if time < 0.9995 else f"{time:.3g} ms"
+        for time in (middle, high, values.max())
+    ]
     words = ", ".join(shown)
     if values.max() > limit:
         axes.plot(values.max(), i, color="black", marker="X", markersize=6.5, linestyle="")
@@ -187,9 +221,14 @@ def _never(runs: pd.DataFrame, column: str) -> pd.Series[bool]:
     return _moves(runs) & comparison.settling_times(runs).isna() & (column == SETTLING)
 
 
-def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str) -> None:
+def _draw_dots(
+    axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str
+) -> None:
     """Draw a measure of the runs of one task."""
-    values, never = comparison.shown_unit(column, runs)[1] * runs[column].astype(float), _never(runs, column)
+    values, never = (
+        comparison.shown_unit(column, runs)[1] * runs[column].astype(float),
+        _never(runs, column),
+    )
     floor = values.max() / MAX_RANGE
     values = values.where(~((values > 0.0) & (values < floor)), floor)
     if column == SETTLING:
@@ -204,14 +243,26 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
         for completed in (True, False):
             chosen = own & ((runs["status"] == COMPLETED) == completed)
             points = values.where(~never, edge)[chosen].dropna().to_numpy()
-            if len(points) == 0:  # an empty line that is not clipped would count as a mark at the origin
+            if (
+                len(points) == 0
+            ):  # an empty line that is not clipped would count as a mark at the origin
                 continue
             face = style.colour if completed else "none"
             axes.plot(points, np.full(len(points), i), color=style.colour, marker=style.marker or "o", linestyle="",
                       markersize=4.5, markerfacecolor=face, markeredgewidth=0.7, alpha=0.55, clip_on=False)  # fmt: skip
-        middle = values[own].fillna(math.inf).median() if column == SETTLING else values[own].median()
+        middle = (
+            values[own].fillna(math.inf).median() if column == SETTLING else values[own].median()
+        )
         if own.sum() > 1 and math.isfinite(middle):
-            axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
+            axes.plot(
+                middle,
+                i,
+                color="black",
+                marker="|",
+                markersize=9,
+                markeredgewidth=1.6,
+                linestyle="",
+            )
         if never[own].any():
             axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="left", va="center", xytext=(5, 0),
                           textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
@@ -241,12 +292,15 @@ def draw_places(axes: Axes, places: Sequence[float], values: Curves, styles: Sty
         style = styles[name]
         shift = width * ((k + 0.5) / len(values) - 0.5)
         x = np.array(places, dtype=float) + shift
-        y, low, high = (np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high"))
+        y, low, high = (
+            np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high")
+        )
         known = np.isfinite(y)
         if known.any():
             y, top = y[known], float(np.max(y[known]))
             below = y - np.where(np.isfinite(low), low, np.nan)[known]
-            above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y  # out of the picture
+            # Out of the picture
+            above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y
             axes.errorbar(
                 x[known], y, yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0), color=style.colour,
                 linestyle="none", marker=style.marker or "_", markersize=4.5, linewidth=1.2,
@@ -254,7 +308,9 @@ def draw_places(axes: Axes, places: Sequence[float], values: Curves, styles: Sty
             )  # fmt: skip
 
 
-def draw_curves(axes: Axes, places: Sequence[float], values: Curves, styles: Styles, top: float) -> None:
+def draw_curves(
+    axes: Axes, places: Sequence[float], values: Curves, styles: Styles, top: float
+) -> None:
     """Draw an estimate over a quantity, a line a method with its interval as a band; abscissae are to scale.
 
     Methods with the same curve share one line, and the panel names them. An infinite estimate is a mark at the upper
@@ -263,11 +319,15 @@ def draw_curves(axes: Axes, places: Sequence[float], values: Curves, styles: Sty
     x, groups = np.array(places, dtype=float), same_curves(values)
     for names in groups:
         first, style = names[0], styles[names[0]]
-        y, low, high = (np.array([getattr(e, part) for e in values[first]]) for part in ("value", "low", "high"))
+        y, low, high = (
+            np.array([getattr(e, part) for e in values[first]]) for part in ("value", "low", "high")
+        )
         known = ~np.isnan(y)
         if not known.any():
             continue
-        edges = np.nan_to_num(np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=1.05 * top)
+        edges = np.nan_to_num(
+            np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=1.05 * top
+        )
         axes.fill_between(x[known], *edges, color=style.colour, alpha=0.12, linewidth=0.0)
         _draw_line(axes, x[known], y[known], style, first, top)
         for name in names[1:]:
@@ -291,11 +351,20 @@ def same_curves(values: Curves) -> list[list[str]]:
     return list(groups.values())
 
 
-def _draw_line(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle, name: str, top: float) -> None:
-    look: dict[str, Any] = {"color": style.colour, "markerfacecolor": style.face, "markersize": 4.5, "linewidth": 1.2}
+def _draw_line(
+    axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle, name: str, top: float
+) -> None:
+    look: dict[str, Any] = {
+        "color": style.colour,
+        "markerfacecolor": style.face,
+        "markersize": 4.5,
+        "linewidth": 1.2,
+    }
     beyond = ~np.isfinite(y)
     shown = np.where(beyond, UPPER * top, y)
-    axes.plot(x, shown, label=name, linestyle=style.line, marker=style.marker, markevery=~beyond, **look)
+    axes.plot(
+        x, shown, label=name, linestyle=style.line, marker=style.marker, markevery=~beyond, **look
+    )
     if beyond.any():
         axes.plot(x[beyond], np.full(np.count_nonzero(beyond), UPPER * top), linestyle="none", marker=6,
                   **(look | {"markersize": 6.5}))  # fmt: skip
@@ -308,7 +377,9 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -
         return None
     figure, panels = panel_grid(len(sweeps), 2.5, layout)
     for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
-        shares = {key: comparison.settled_share(own) for key, own in part.groupby(["controller", "size"])}
+        shares = {
+            key: comparison.settled_share(own) for key, own in part.groupby(["controller", "size"])
+        }
         names, sizes = part["controller"].unique(), sorted(part["size"].unique())
         values = {name: [shares.get((name, size), NO_ESTIMATE) for size in sizes] for name in names}
         draw_curves(axes, sizes, values, styles, top=104.0)
@@ -325,7 +396,11 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     an axis; else the mismatches are read, and runs without mismatch have size 0 on each axis.
     """
     none = runs.head(0)
-    places = [runs] if "axis" not in runs else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
+    places = (
+        [runs]
+        if "axis" not in runs
+        else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
+    )
     sweeps = {
         label: runs.assign(size=factor * runs[name].astype(float))
         for name, (label, factor) in varied_columns(runs.columns).items()
@@ -338,5 +413,11 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     along = along.assign(size=along["magnitude"].astype(float))
     for (axis, unit), group in along.groupby(["axis", "unit"], sort=False):
         name = str(axis).replace("_", " ")
-        sweeps[f"{name} [{unit}]" if unit else name] = pd.concat([none, group]) if len(none) else group
-    return {label: part.dropna(subset=["size"]) for label, part in sweeps.items() if part["size"].nunique() > 1}
+        sweeps[f"{name} [{unit}]" if unit else name] = (
+            pd.concat([none, group]) if len(none) else group
+        )
+    return {
+        label: part.dropna(subset=["size"])
+        for label, part in sweeps.items()
+        if part["size"].nunique() > 1
+    }

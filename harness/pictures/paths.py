@@ -11,7 +11,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.style import DESIRED, LETTER, WIDE, Layout, Styles, add_legend, divisions, mark_end
+from servobench.harness.pictures.style import (
+    DESIRED,
+    LETTER,
+    WIDE,
+    Layout,
+    Styles,
+    add_legend,
+    divisions,
+    mark_end,
+)
 from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
@@ -23,7 +32,11 @@ SLIMMEST, TALLEST = 0.3, 1.0  # height of a view over its width
 ROOM: Final = 1.16  # of a view over the paths in it
 ARROW: Final = 0.06  # of a curve, from where to where an arrow shows its direction
 # Labels of a feature in the frame of the camera.
-CAMERA_FRAME: Final = {"x_m": "x, to the right [m]", "y_m": "y, downwards [m]", "z_m": "z, depth downwards [m]"}
+CAMERA_FRAME: Final = {
+    "x_m": "x, to the right [m]",
+    "y_m": "y, downwards [m]",
+    "z_m": "z, depth downwards [m]",
+}
 PIXELS: Final = "px"  # unit of a feature in an image, where the second one of a pair points down
 
 
@@ -61,7 +74,9 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
             extent.apply(axes, view, ratios[i])
             title = f"{heading}: {view.title}" if len(views) > 1 else heading
             axes.set_title(textwrap.fill(title, round((layout.width / columns - BESIDE) / LETTER)))
-            if view is not views[-1] and views[views.index(view) + 1].across == view.across:  # one abscissa for both
+            if (
+                view is not views[-1] and views[views.index(view) + 1].across == view.across
+            ):  # one abscissa for both
                 axes.set_xlabel("")
                 axes.tick_params(labelbottom=False)
     for axes in grid.flat:
@@ -88,7 +103,10 @@ def _views(tracks: Tracks) -> list[View]:
         return [View("camera's view", 0, 1), View("from the side", 0, 2)]
     names = [name.rpartition("_")[0] for name in features]
     if features[0].endswith(f"_{PIXELS}") and len(names) % 2 == 0:
-        return [View(f"{names[i + 1]} over {names[i]}", i, i + 1) for i in range(0, min(4, len(names)), 2)]
+        return [
+            View(f"{names[i + 1]} over {names[i]}", i, i + 1)
+            for i in range(0, min(4, len(names)), 2)
+        ]
     return [View(f"{names[i]} over {names[0]}", 0, i) for i in range(1, min(3, len(names)))]
 
 
@@ -142,7 +160,9 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
                 mark_end(axes, points[:, 0], points[:, 1], styles[name])
     start = _points(whole, "true_feature_")[:1, chosen]
     hollow: dict[str, Any] = {"color": "black", "markerfacecolor": "white", "linestyle": ""}
-    axes.plot(*start.T, marker="s", markersize=6, markeredgewidth=1.3, label="start", zorder=10, **hollow)
+    axes.plot(
+        *start.T, marker="s", markersize=6, markeredgewidth=1.3, label="start", zorder=10, **hollow
+    )
     if whole.point_to_point:
         axes.plot(*reference[:1].T, marker="*", markersize=10, label="target", zorder=11, **hollow)
     labels = [CAMERA_FRAME.get(whole.features[i], label_of(whole.features[i])) for i in chosen]
@@ -154,7 +174,14 @@ def _draw_direction(axes: Axes, reference: FloatArray) -> None:
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
     first, second = np.searchsorted(way, [ARROW * way[-1], 1.4 * ARROW * way[-1]])
     if first < second < len(reference):
-        look = {"arrowstyle": "-|>", "color": "black", "lw": 1.2, "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
+        look = {
+            "arrowstyle": "-|>",
+            "color": "black",
+            "lw": 1.2,
+            "mutation_scale": 14,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         axes.annotate("", reference[second], reference[first], arrowprops=look, zorder=9)
 
 

@@ -52,7 +52,9 @@ class LoggedRun:
     track: Track  # its row in the table of runs, and its steps
     robot: Robot  # by its maker's description
     model: HandEyeModel  # the true arm and camera
-    moved: HandEyeModel | None  # the same after the camera was moved in the middle of the run; None if it was not
+    moved: (
+        HandEyeModel | None
+    )  # the same after the camera was moved in the middle of the run; None if it was not
     moved_from: int  # first period that the moved camera sees; the number of periods if none
     joint_position: FloatArray  # (k, n) [rad], as reported
     ball: FloatArray  # (k, 3) [m], base frame
@@ -71,15 +73,20 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
     """
     run_id = row["run_id"]
     if row.get("robot") == OWN_ROBOT:
-        raise ConfigurationError(f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own")
+        raise ConfigurationError(
+            f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own"
+        )
     sensing = row.get("sensing", DEFAULT_SENSING)
     if sensing != DEFAULT_SENSING:
-        raise ConfigurationError(f"run {run_id} cannot be shown: films have the sensing position, not {sensing}")
+        raise ConfigurationError(
+            f"run {run_id} cannot be shown: films have the sensing position, not {sensing}"
+        )
     if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
     track = track_of(row, steps)
     robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
-    names = [str(name) for name in track.table if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
+    # A plant may call its joints as it likes
+    names = [str(name) for name in track.table if JOINT.fullmatch(str(name))]
     if len(names) != robot.arm.n:
         wanted = f"wanted the {robot.arm.n} of a {robot.title}"
         raise ConfigurationError(f"run {run_id} has {len(names)} joint positions [rad]; {wanted}")
@@ -92,7 +99,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
         return np.concatenate([model.to_base(before), (moved or model).to_base(after)])
 
     reference, true = track.vectors("reference_"), in_base(ball)
-    apart = float(np.nanmax(np.linalg.norm(model.to_base(model.feature(q)) - true, axis=1), initial=0.0))
+    apart = float(
+        np.nanmax(np.linalg.norm(model.to_base(model.feature(q)) - true, axis=1), initial=0.0)
+    )
     if apart > MAX_APART:
         why = "films have no play of gears, no flexible tool and no camera that turns"
         remark(f"run {run_id}: the ball was up to {apart:.2g} m from where it is drawn, as {why}")
@@ -153,7 +162,9 @@ class Replay(AbstractContextManager["Replay"]):
         """Return the image of the run's camera with the detected ball marked, (h, w, 3)."""
         rgba, buffer = self._scene.render(self._camera, self._pose)
         found = find_ball(rgba, buffer, self._camera, self._run.robot.workspace.ball_radius)
-        return draw_detection(rgba[..., :3], found, self._camera, self._run.robot.workspace.ball_radius)
+        return draw_detection(
+            rgba[..., :3], found, self._camera, self._run.robot.workspace.ball_radius
+        )
 
     def overview(self, trails: list[Trail]) -> ByteArray:
         """Return the arm from outside with trails, pale where they are hidden: (480, 640, 3) times the fineness."""
@@ -179,9 +190,19 @@ class Replay(AbstractContextManager["Replay"]):
         for wanted in (True, False):
             layer = picture.copy() if wanted else picture
             for i in np.flatnonzero(covered == wanted):
-                cv2.line(layer, corners[i].tolist(), corners[i + 1].tolist(), trail.colour, width, cv2.LINE_AA, 4)
+                cv2.line(
+                    layer,
+                    corners[i].tolist(),
+                    corners[i + 1].tolist(),
+                    trail.colour,
+                    width,
+                    cv2.LINE_AA,
+                    4,
+                )
             if wanted:
-                cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
+                cv2.addWeighted(
+                    layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture
+                )
 
 
 def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:
@@ -194,7 +215,9 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
         mismatch = Mismatch.parse(row["mismatch"])
         model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
     if mismatch.size("camera_turn") > 0.0:
-        raise ConfigurationError(f"run {row['run_id']} cannot be shown: films have no camera that turns")
+        raise ConfigurationError(
+            f"run {row['run_id']} cannot be shown: films have no camera that turns"
+        )
     logged, drawn = values_drawn(row), json.loads(json.dumps(sample.as_record()))
     if any(logged.get(name) != value for name, value in drawn.items()):
         raise ConfigurationError(
@@ -205,8 +228,12 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
     return model, moved if isinstance(moved, HandEyeModel) else None
 
 
-def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:
+def _first_seen_by(
+    moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray
+) -> int:
     """Return the first period in which the true feature (k, m) is that of the moved camera at q (k, n)."""
-    before, after = (np.linalg.norm(camera.feature(q) - feature, axis=1) for camera in (model, moved))
+    before, after = (
+        np.linalg.norm(camera.feature(q) - feature, axis=1) for camera in (model, moved)
+    )
     seen = np.flatnonzero(after < before)
     return int(seen[0]) if len(seen) else len(q)

@@ -20,12 +20,25 @@ from markupsafe import Markup, escape
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import comparison, tables
 from servobench.harness.analysis.comparison import MISSING
-from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings, titled_runs
+from servobench.harness.analysis.folder import (
+    describe_controllers,
+    describe_folder,
+    describe_settings,
+    titled_runs,
+)
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.figures import KINDS, page_figures
 from servobench.harness.pictures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
-from servobench.harness.pictures.tracks import COLUMNS, Shown, Tracks, label_of, load_groups, load_tracks, longest
+from servobench.harness.pictures.tracks import (
+    COLUMNS,
+    Shown,
+    Tracks,
+    label_of,
+    load_groups,
+    load_tracks,
+    longest,
+)
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.request import DEFAULT_ROBOT, varied_columns
@@ -39,9 +52,18 @@ OWN: Final = Path(__file__).parent  # of template, style and scripts
 PICTURE_BYTES: Final = 3_000_000  # of all figures in the page
 SHOWN_RUNS: Final = 1000  # rows of the table of runs
 LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
-COUNTED: Final = {"controller": "controllers", "task": "tasks", "plant": "plants", "mismatch": "mismatches"}
+COUNTED: Final = {
+    "controller": "controllers",
+    "task": "tasks",
+    "plant": "plants",
+    "mismatch": "mismatches",
+}
 USUAL: Final = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}  # not mentioned
-SWEPT: Final = {"noise_factor": "factors of noise", "latency_s": "latencies", "period_s": "control periods"}
+SWEPT: Final = {
+    "noise_factor": "factors of noise",
+    "latency_s": "latencies",
+    "period_s": "control periods",
+}
 MOST_POINTS = 150  # of a path; more cannot be distinguished
 MOST_VIEWS = 24  # plant, mismatch and task
 CURVE_POINTS = (40, 160)  # of the error of a run: at least, at most
@@ -53,7 +75,8 @@ DASHES = {"-": [], "--": [7, 4], "-.": [8, 3, 2, 3], ":": [2, 3]}  # px, of the 
 Json = dict[str, Any]
 ESTIMATE: Final = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<high>[^,\[\]]+)\]")
 NUMBER: Final = re.compile(r"[-+]?(\d|∞|–$)")
-BREAKS: Final = re.compile(r"([_:+=/,.])")  # signs after which a long name may go on in the next line
+# Signs after which a long name may go on in the next line
+BREAKS: Final = re.compile(r"([_:+=/,.])")
 TICKED: Final = re.compile(r"`([^`]*)`")
 CONTROLLER: Final = (tables.WHICH, "controller")
 INFINITE: Final = "∞"
@@ -81,14 +104,18 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     results.check_runs(folder, runs)
     target = path or folder / NAME
     with accessing(target, "report"):
-        write_atomically(target, lambda file: file.write_text(_page(folder, runs), encoding="utf-8"))
+        write_atomically(
+            target, lambda file: file.write_text(_page(folder, runs), encoding="utf-8")
+        )
     return target
 
 
 def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
     pictures, size = [], 0
-    for named, slim in page_figures(folder, runs, [name for name, kind in KINDS.items() if kind.in_page]):
+    for named, slim in page_figures(
+        folder, runs, [name for name, kind in KINDS.items() if kind.in_page]
+    ):
         wide, narrow = drawing_of(named.figure, WIDE), drawing_of(slim.figure, NARROW)
         size += len(wide.data) + len(narrow.data)
         if size > PICTURE_BYTES:
@@ -99,11 +126,18 @@ def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
     views, shown = path_views(folder, runs), _shown(runs)
-    style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
+    style, scripts = (
+        _asset("report.css"),
+        [_asset("report.js"), *([_asset("space.js")] if views else [])],
+    )
     numbered, facts = tables.runs_table(shown), describe_folder(folder, runs)
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
     environment = Environment(
-        loader=FileSystemLoader(OWN), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(OWN),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters |= {"breakable": breakable, "cell": cell, "marked": marked, "sheet": sheet}
     return environment.get_template(TEMPLATE).render(
@@ -140,7 +174,10 @@ def _policy(style: str, scripts: list[str]) -> str:
     """Return the page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
 
     def digests(texts: list[str]) -> str:
-        found = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts)
+        found = (
+            base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+            for text in texts
+        )
         return " ".join(f"'sha256-{digest}'" for digest in found)
 
     own = f"style-src {digests([style])}; script-src {digests(scripts)}"
@@ -163,7 +200,9 @@ def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the runs that have a row, with their place in the table: of many, those that went wrong before others."""
     known = runs.reset_index(drop=True)
     wrong = ~comparison.outcomes(known).isin(ACHIEVED)
-    return known.loc[wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]].sort_index()
+    return known.loc[
+        wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]
+    ].sort_index()
 
 
 def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
@@ -193,7 +232,9 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
         "swatches": {
             name: {
                 "colour": style.colour,
-                "dash": DASHES[style.line] if style.line in DASHES else [2.0 * length for length in style.line[1]],
+                "dash": DASHES[style.line]
+                if style.line in DASHES
+                else [2.0 * length for length in style.line[1]],
             }
             for name, style in method_styles(shown["controller"].astype(str)).items()
         },
@@ -227,9 +268,14 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     points = int(np.clip(CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted))), least, most))
     curves = {}
     for first in range(0, len(wanted), STEPS_AT_ONCE):
-        for track in load_tracks(folder, wanted[first : first + STEPS_AT_ONCE], COLUMNS[:3]):  # the error over time
+        for track in load_tracks(
+            folder, wanted[first : first + STEPS_AT_ONCE], COLUMNS[:3]
+        ):  # the error over time
             bins = np.array_split(track.error(), min(points, len(track.table)))
-            error = [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins]
+            error = [
+                rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None
+                for part in bins
+            ]
             end, unit = rounded(float(track.time[-1])), track.error_unit[0]
             curves[track.row["run_id"]] = {"end": end, "unit": unit, "error": error}
     return curves
@@ -249,7 +295,9 @@ def _view(title: str, tracks: Tracks) -> Json:
         "axes": [label_of(name).replace("z [", "depth z [") for name in whole.features[:3]],
         "reference": _points(reference[:1] if whole.point_to_point else reference),
         "start": _points(whole.vectors("true_feature_")[:1, :3]),
-        "paths": {name: _points(track.vectors("true_feature_")[:, :3]) for name, track in few.items()},
+        "paths": {
+            name: _points(track.vectors("true_feature_")[:, :3]) for name, track in few.items()
+        },
     }
 
 
@@ -257,7 +305,9 @@ def _points(points: FloatArray) -> list[list[float | None]]:
     """Return points as rows of a few significant numbers."""
     step = max(1, -(-len(points) // MOST_POINTS))
     chosen = points[np.isfinite(points).all(axis=1)]
-    kept = np.unique([*range(0, len(chosen), step), *([len(chosen) - 1] if len(chosen) else [])]).astype(int)
+    kept = np.unique(
+        [*range(0, len(chosen), step), *([len(chosen) - 1] if len(chosen) else [])]
+    ).astype(int)
     return [[rounded(float(x)) for x in point] for point in chosen[kept]]
 
 
@@ -277,7 +327,9 @@ class Cell(NamedTuple):
 class Sheet(NamedTuple):
     """The columns of a table."""
 
-    groups: list[tuple[str, int]]  # title and number of columns of each group of columns; empty without groups
+    groups: list[
+        tuple[str, int]
+    ]  # title and number of columns of each group of columns; empty without groups
     headings: list[tuple[str, str]]  # of each column: name, unit
     size: str  # `few`, `some` or `many` columns, for the width at which rows become cards
     pairs: bool  # whether every group has two columns, which stay side by side in a card
@@ -305,7 +357,9 @@ def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table
     match = ESTIMATE.fullmatch(text)
     if match is None:
         return Cell(text, number=NUMBER.match(text) is not None)
-    if {match["value"][0], match["low"], match["high"]} == {INFINITE}:  # an interval from ∞ to ∞ says nothing
+    if {match["value"][0], match["low"], match["high"]} == {
+        INFINITE
+    }:  # an interval from ∞ to ∞ says nothing
         return Cell(INFINITE, number=True)
     return Cell(match["value"], f"{match['low']} to {match['high']}", number=True)
 

@@ -57,11 +57,12 @@ LINE: Final = 0.17  # [in] of the legend
 DrawPanel = Callable[[Axes, Ensembles, Styles], None]
 COMMAND: Final = "joint_velocity_command_"
 ROW: Final = 0.72  # [in] a controller
+# A column of panels each: its title, the metric written into it, and its form
 QUANTITIES: Final = (
     ("joint speed [rad/s]", "command_switches", "{:.0f} sign switches"),
     ("acceleration [rad/s²]", "joint_acceleration_rms_rad_s2", "RMS {:.3g}"),
     ("jerk [rad/s³]", "joint_jerk_rms_rad_s3", "RMS {:.3g}"),
-)  # a column of panels each: its title, the metric written into it, and its form
+)
 MARK_SIZE: Final = 6.5  # [points] width of the mark at a settling time
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
 AXIS_ROOM: Final = 1.3  # of an axis over the largest error after the approach
@@ -78,19 +79,28 @@ def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = 
     settled.
     """
     figure, panels = _draw_tasks(tasks, styles, draw_error, layout)
-    show_errors(panels[0][0], [ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
+    show_errors(
+        panels[0][0], [ensemble for ensembles in tasks.values() for ensemble in ensembles.values()]
+    )
     for axes, task in panels:
-        until, end = shown_until(tasks[task]), max(float(own.time[-1]) for own in tasks[task].values())
+        until, end = (
+            shown_until(tasks[task]),
+            max(float(own.time[-1]) for own in tasks[task].values()),
+        )
         if until < end:
             axes.set_xlim(-0.02 * until, until)
             axes.set_xlabel(f"time [s]; the move lasts {end:.2g} s")
     return figure
 
 
-def draw_jacobians(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+def draw_jacobians(
+    tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE
+) -> Figure | None:
     """Draw how far the estimated Jacobian is from the true one, over seeds; None if no run knows it."""
     known = {
-        task: {name: own for name, own in ensembles.items() if np.isfinite(own.jacobian_error).any()}
+        task: {
+            name: own for name, own in ensembles.items() if np.isfinite(own.jacobian_error).any()
+        }
         for task, ensembles in tasks.items()
     }
     known = {task: ensembles for task, ensembles in known.items() if ensembles}
@@ -123,7 +133,9 @@ def draw_features(
     return figure
 
 
-def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: Layout = WIDE) -> Figure:
+def draw_tracking(
+    ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: Layout = WIDE
+) -> Figure:
     """Draw the error along a curve over seeds, and below it the error in each feature of one run (figure 6).
 
     Of a long run, the latter is drawn at its end only, on a narrow sheet not at all.
@@ -162,7 +174,9 @@ def _draw_tasks(
     names = {name for ensembles in tasks.values() for name in ensembles}
     row = 2.8 if layout.wide and len(cells) == 1 else 2.0
     head = 0.6 + LINE * (2 + len(names) * (0.25 if layout.wide else 1.0))
-    figure, panels = panel_grid(len(cells), row, replace(layout, columns=min(COLUMNS, layout.columns)), head)
+    figure, panels = panel_grid(
+        len(cells), row, replace(layout, columns=min(COLUMNS, layout.columns)), head
+    )
     for axes, (task, heading, ensembles) in zip(panels, cells, strict=True):
         draw(axes, ensembles, styles)
         axes.set(title=", ".join(filter(None, (task, heading))), xlabel="time [s]")
@@ -185,7 +199,9 @@ def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) ->
     if first.point_to_point:
         _mark_settling_times(axes, ensembles, styles)
     if math.isfinite(first.camera_moved_at):
-        axes.axvline(first.camera_moved_at, color="0.4", linewidth=0.9, linestyle="-.", label=CAMERA_MOVES)
+        axes.axvline(
+            first.camera_moved_at, color="0.4", linewidth=0.9, linestyle="-.", label=CAMERA_MOVES
+        )
     averaged = "" if first.point_to_point else f",\nRMS over {WINDOW:g} s"
     axes.set_ylabel(f"true error [{first.error_unit[0]}]{averaged}")
 
@@ -195,7 +211,10 @@ def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
 
     Errors of a small part of the settling band are left out: they are noise, which a median describes better.
     """
-    largest = max(float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0)) for ensemble in ensembles)
+    largest = max(
+        float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0))
+        for ensemble in ensembles
+    )
     if largest > 0.0:
         low = FLOOR * next(iter(ensembles)).settling_band
         plain_logarithms(axes)
@@ -204,20 +223,31 @@ def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
 
 def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
     """Draw the relative error of the estimated Jacobian over time, its median and band over seeds, logarithmic."""
-    exact = [name for name, ensemble in ensembles.items() if np.nanmax(ensemble.jacobian_error, initial=0.0) < EXACT]
+    exact = [
+        name
+        for name, ensemble in ensembles.items()
+        if np.nanmax(ensemble.jacobian_error, initial=0.0) < EXACT
+    ]
     others = {name: ensemble for name, ensemble in ensembles.items() if name not in exact}
     draw_over_seeds(axes, others, styles, lambda ensemble: ensemble.jacobian_error)
     for name in exact:
         axes.plot([], [], label=f"{name} (exact)", **styles[name].line_arguments(1))
     axes.set_ylabel("Jacobian error [%]")
-    if any((np.asarray(line.get_ydata(), dtype=np.float64) > 0.0).any() for line in axes.get_lines()):
+    if any(
+        (np.asarray(line.get_ydata(), dtype=np.float64) > 0.0).any() for line in axes.get_lines()
+    ):
         plain_logarithms(axes)
     else:
-        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color="0.4")
+        axes.text(
+            0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color="0.4"
+        )
 
 
 def draw_over_seeds(
-    axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles, curve: Callable[[Ensemble], FloatArray]
+    axes: Axes,
+    ensembles: Mapping[str, Ensemble],
+    styles: Styles,
+    curve: Callable[[Ensemble], FloatArray],
 ) -> None:
     """Draw the median over seeds of a curve of each ensemble, (r, k), and between which values most seeds are."""
     for name, ensemble in ensembles.items():
@@ -242,7 +272,9 @@ def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str
     axes.axhline(0.0, color="0.4", linewidth=0.9)
     reach = 0.0
     for label, track in tracks.items():
-        error = factor * (track.column(f"true_feature_{feature}") - track.column(f"reference_{feature}"))
+        error = factor * (
+            track.column(f"true_feature_{feature}") - track.column(f"reference_{feature}")
+        )
         _draw_values(axes, track, error, label, styles)
         late = np.abs(error[len(error) // 2 :])
         reach = max(reach, float(np.max(late[np.isfinite(late)], initial=0.0)))
@@ -265,7 +297,9 @@ def mark_settling_band(axes: Axes, runs: Shown) -> None:
     """Draw the error within which a run counts as settled, where the table of runs has it."""
     if math.isfinite(runs.settling_band):
         label = f"settling band, {runs.settling_band:g} {runs.error_unit[0]}"
-        axes.axhline(runs.settling_band, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=label)
+        axes.axhline(
+            runs.settling_band, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=label
+        )
 
 
 def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
@@ -273,7 +307,11 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
     near = NEAR * shown_until(ensembles)
     anchor = -math.inf
     beside = 0  # marks that stand from the anchor on
-    settled = [each for each in ensembles.items() if math.isfinite(each[1].settling_time + each[1].settling_band)]
+    settled = [
+        each
+        for each in ensembles.items()
+        if math.isfinite(each[1].settling_time + each[1].settling_band)
+    ]
     for name, ensemble in sorted(settled, key=lambda each: each[1].settling_time):
         if ensemble.settling_time >= anchor + beside * near:
             anchor = ensemble.settling_time
@@ -281,7 +319,11 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
         style = styles[name]
         edge = style.colour if style.hollow else "black"
         place = offset_copy(
-            axes.transData, axes.get_figure(root=True), MARK_SIZE * beside, -0.6 * MARK_SIZE, units="points"
+            axes.transData,
+            axes.get_figure(root=True),
+            MARK_SIZE * beside,
+            -0.6 * MARK_SIZE,
+            units="points",
         )
         axes.plot(anchor, ensemble.settling_band, marker="^", markersize=MARK_SIZE, linestyle="", transform=place,
                   color=style.colour, markeredgecolor=edge, markeredgewidth=1.4 if style.hollow else 0.6,
@@ -295,7 +337,10 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
     A long run is shown at its end. A wide layout has room for a metric in each panel.
     """
     shown = {name: track.closing() for name, track in tracks.items()}
-    columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)
+    columns = max(
+        ([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()),
+        key=len,
+    )
     if not columns:
         return None
     figure = Figure(figsize=(layout.width, 1.2 + max(ROW * len(shown), 1.6)), layout="constrained")
@@ -305,10 +350,14 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
             _draw_joint(line, track, column, number)
         for axes, (_, metric, form) in zip(line, QUANTITIES, strict=True):
             known = track.row.get(metric)
-            words = "" if known is None or np.isnan(known) or not layout.wide else form.format(known)
+            words = (
+                "" if known is None or np.isnan(known) or not layout.wide else form.format(known)
+            )
             axes.text(0.985, 0.93, words, transform=axes.transAxes, ha="right", va="top", fontsize=TEXT - 1.5,
                       bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0})  # fmt: skip
-        line[0].set_ylabel(name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5)
+        line[0].set_ylabel(
+            name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5
+        )
     for axes, (title, _, _) in zip(panels[0], QUANTITIES, strict=True):
         axes.set_title(title if layout.wide else title.replace(" [", "\n["))
     for axes in panels[-1]:

@@ -40,7 +40,8 @@ TEXT = 8.0  # [pt] of a figure of that width
 FILM_TEXT = 9.0  # [pt]
 FORMATS = ("png", "pdf")
 ALL_FORMATS: Final = (*FORMATS, "svg", "pgf")
-INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4, "pt": 72.27}  # unit -> how many of it are an inch
+# Unit -> how many of it are an inch
+INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4, "pt": 72.27}
 TWO_COLUMNS: Final = 5.0  # [in] from which on panels stand beside each other
 PGF_TEXT: Final = re.compile(r"(?<=\\def%\{\\%\}).*(?=\}\}%$)", re.MULTILINE)
 UNDERSCORE: Final = re.compile(r"(\$[^$]*\$)|(?<!\\)_")  # outside of formulas
@@ -55,7 +56,8 @@ PALETTE = 64  # colours
 STRIP = 0.04  # [in] above and below the drawing
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
-NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)  # in a legend
+# In a legend
+NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)
 FEW_DECADES: Final = 50.0  # upper over lower end of a logarithmic axis
 LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of its sample line
 MARGIN: Final = 0.2  # [in] on both sides of the legend
@@ -66,11 +68,12 @@ JOINTS: Final = (
 )  # fmt: skip  # colours and lines of joints in their order
 DASHED = (0, (3.5, 1.5))  # of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
+# Colours, lines and markers of unknown methods
 _OTHERS: Final[tuple[tuple[Any, ...], ...]] = (
     (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN),
     ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-."),
     ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in ascii_lowercase)),
-)  # colours, lines and markers of unknown methods
+)
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,9 @@ class Layout:
         number, unit = split_quantity(text) or (math.nan, "")
         width = number / INCHES.get(unit, math.nan)
         if not 2.0 <= width <= 20.0:
-            raise ConfigurationError(f"--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got {text}")
+            raise ConfigurationError(
+                f"--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got {text}"
+            )
         return cls(width, WIDE.columns if width >= TWO_COLUMNS else 1, WIDE.pixels, WIDE.density)
 
     @property
@@ -137,7 +142,9 @@ class MethodStyle:
         """Return keyword arguments for a line through `points`, (k, d), with about eight markers evenly along it."""
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         places = (np.arange(MARKS) + self.shift) / MARKS * way[-1]
-        return self.line_arguments(1) | {"markevery": np.unique(np.searchsorted(way, places)).tolist()}
+        return self.line_arguments(1) | {
+            "markevery": np.unique(np.searchsorted(way, places)).tolist()
+        }
 
 
 Styles = dict[str, MethodStyle]
@@ -154,7 +161,9 @@ _STYLES = {
     "rls": MethodStyle(SKY, "-", "X"),
     "cfdl_mfac": MethodStyle(YELLOW, "-", "p"),
 }
-_STYLES |= {name + PUBLISHED: replace(style, line=DASHED, hollow=True) for name, style in _STYLES.items()}
+_STYLES |= {
+    name + PUBLISHED: replace(style, line=DASHED, hollow=True) for name, style in _STYLES.items()
+}
 
 
 def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
@@ -165,7 +174,10 @@ def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
     wanted = list(dict.fromkeys(names))
     unknown = sorted(name for name in wanted if name not in _STYLES)
     styles = {name: _STYLES.get(name) or _other(unknown.index(name)) for name in wanted}
-    return {name: replace(style, shift=i / len(styles)) for i, (name, style) in enumerate(styles.items())}
+    return {
+        name: replace(style, shift=i / len(styles))
+        for i, (name, style) in enumerate(styles.items())
+    }
 
 
 def divisions(names: Iterable[str]) -> dict[str, list[str]]:
@@ -200,7 +212,9 @@ def figure_style(size: float = FILM_TEXT) -> Iterator[None]:
     A `matplotlibrc` or a style of the user's does not count: pictures are the same on every machine.
     """
     defaults: dict[Any, Any] = {
-        name: value for name, value in mpl.rcParamsDefault.items() if name != "backend" and mpl.rcParams[name] != value
+        name: value
+        for name, value in mpl.rcParamsDefault.items()
+        if name != "backend" and mpl.rcParams[name] != value
     }
     style = mpl.rc_context(
         {
@@ -222,7 +236,9 @@ def figure_style(size: float = FILM_TEXT) -> Iterator[None]:
         yield
 
 
-def panel_grid(count: int, height: float, layout: Layout = WIDE, head: float = 1.0) -> tuple[Figure, list[Axes]]:
+def panel_grid(
+    count: int, height: float, layout: Layout = WIDE, head: float = 1.0
+) -> tuple[Figure, list[Axes]]:
     """Return a figure of panels with a common ordinate, and its `count` panels.
 
     A row is `height` high [in], title and legend together `head` [in].
@@ -267,7 +283,9 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
             entries.setdefault(label, handle)
     for gid, marker in ((SETTLED, "^"), (ENDED, END)):
         if any(line.get_gid() == gid for axes in panels for line in axes.get_lines()):
-            entries[gid] = mpl.lines.Line2D([], [], color="0.3", marker=marker, markersize=7, linestyle="")
+            entries[gid] = mpl.lines.Line2D(
+                [], [], color="0.3", marker=marker, markersize=7, linestyle=""
+            )
     entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))
     if entries:
         letters = math.floor((figure.get_figwidth() - SAMPLE - MARGIN) / LETTER)
@@ -321,7 +339,9 @@ def save_figure(
             box = Bbox.from_extents(0.0, drawn.y0, figure.get_figwidth(), drawn.y1)
         for ending in formats:
             paths.append(stem.with_name(f"{stem.name}.{ending}"))
-            write_atomically(paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box)))
+            write_atomically(
+                paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box))
+            )
             figure.set_layout_engine(None)  # freeze the layout: computing it dominates the save
     return paths
 
@@ -333,18 +353,23 @@ def _encode(figure: Figure, ending: str, box: Bbox | None) -> bytes:
         figure.set_dpi(RESOLUTION)
         FigureCanvasAgg(figure).print_png(content, **UNDATED[ending])  # type: ignore[no-untyped-call]
     else:
-        figure.savefig(content, format=ending, dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
+        figure.savefig(
+            content, format=ending, dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {})
+        )
     made = content.getvalue()
     if isinstance(made, bytes):
         return made
-    return PGF_TEXT.sub(lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), made).encode()
+    return PGF_TEXT.sub(
+        lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), made
+    ).encode()
 
 
 def box_of(figure: Figure) -> Bbox:
     """Lay a figure out for good; return the box [in] as high as the drawing and as wide as the figure."""
     if (engine := figure.get_layout_engine()) is not None:
         engine.execute(figure)  # once, also for the edges of the drawing
-        figure.set_layout_engine(None)  # "none" leaves a placeholder, for which a figure is drawn once more
+        # "none" leaves a placeholder, for which a figure is drawn once more
+        figure.set_layout_engine(None)
     drawn = figure.get_tightbbox()
     low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
     return Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
@@ -367,10 +392,14 @@ def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
     with figure_style(TEXT):
         box = box_of(figure)
         unpacked = {"compress_level": 0}  # it is read again at once
-        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box, pil_kwargs=unpacked)
+        figure.savefig(
+            large, dpi=layout.density * layout.scale, bbox_inches=box, pil_kwargs=unpacked
+        )
     # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
     with Image.open(large) as picture:
-        indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        indexed = picture.convert("RGB").quantize(
+            PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+        )
         indexed.save(small, "PNG", optimize=True)
     content = base64.b64encode(small.getvalue()).decode("ascii")
     return Drawing(content, round(layout.scale * box.width), round(layout.scale * box.height))
@@ -383,7 +412,10 @@ def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[
     if count <= 1:
         return {heading: names}
     size = -(-len(own) // count)
-    return {f"{heading} {i + 1} of {count}".lstrip(): own[i * size : (i + 1) * size] + bounds for i in range(count)}
+    return {
+        f"{heading} {i + 1} of {count}".lstrip(): own[i * size : (i + 1) * size] + bounds
+        for i in range(count)
+    }
 
 
 def _other(index: int) -> MethodStyle:

@@ -14,7 +14,13 @@ from typing import Any, Self, final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import POINT_TO_POINT, column_of, handy_unit, settling_times, with_places
+from servobench.harness.analysis.comparison import (
+    POINT_TO_POINT,
+    column_of,
+    handy_unit,
+    settling_times,
+    with_places,
+)
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -23,9 +29,12 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 FEATURE = "feature_"
 LONG = 6000  # [rows] of a run that is not drawn row by row
 OVERVIEW = 600  # [rows] about, that stand for a long run
-CLOSING = 400  # [rows] at the end of a long run that are drawn one by one: two laps at the default period
+CLOSING = (
+    400  # [rows] at the end of a long run that are drawn one by one: two laps at the default period
+)
 ERROR, JACOBIAN, STEP_TIME = "error_norm", "jacobian_error", "controller_time_us"
-ROOT_MEAN_SQUARES = (ERROR, JACOBIAN)  # of which a row of an overview has that of all rows for which it stands
+# of which a row of an overview has that of all rows for which it stands
+ROOT_MEAN_SQUARES = (ERROR, JACOBIAN)
 COLUMNS = ("run_id", "time_s", ERROR, JACOBIAN, STEP_TIME)
 BAND = (0.1, 0.5, 0.9)  # quantiles over seeds: the band's edges and its middle
 WINDOW = 0.5  # [s] over which the error along a curve is averaged
@@ -75,7 +84,9 @@ class Track(Shown):
     @property
     def features(self) -> list[str]:
         """Names of the features with their unit, such as `x_m`."""
-        names = [name.removeprefix(FEATURE) for name in self.table.columns if name.startswith(FEATURE)]
+        names = [
+            name.removeprefix(FEATURE) for name in self.table.columns if name.startswith(FEATURE)
+        ]
         return [name for name in names if f"reference_{name}" in self.table.columns]
 
     @property
@@ -100,7 +111,11 @@ class Track(Shown):
 
     def closing(self) -> Self:
         """Return the end of a long track, row by row."""
-        return replace(self, table=self.table.iloc[-CLOSING:].reset_index(drop=True)) if self.long else self
+        return (
+            replace(self, table=self.table.iloc[-CLOSING:].reset_index(drop=True))
+            if self.long
+            else self
+        )
 
     def for_path(self) -> Self:
         """Return the rows that show the path in space: of a curve that is followed for long, the end."""
@@ -112,11 +127,15 @@ class Track(Shown):
 
     def column(self, name: str) -> FloatArray:
         """Return a column as (k,) numbers; NaN where the run has none."""
-        return np.asarray(self.table.get(name, pd.Series(np.nan, self.table.index)), dtype=np.float64)
+        return np.asarray(
+            self.table.get(name, pd.Series(np.nan, self.table.index)), dtype=np.float64
+        )
 
     def vectors(self, kind: str) -> FloatArray:
         """Return the features of a kind (`feature_`, `true_feature_`, `reference_`), (k, m) in their unit."""
-        return np.stack([self.column(kind + name) for name in self.features], axis=-1).reshape(len(self.table), -1)
+        return np.stack([self.column(kind + name) for name in self.features], axis=-1).reshape(
+            len(self.table), -1
+        )
 
 
 Tracks = dict[str, Track]
@@ -153,11 +172,15 @@ def track_of(row: Mapping[Any, Any], steps: pd.DataFrame) -> Track:
     return Track(row, steps.dropna(axis=1, how="all").reset_index(drop=True))
 
 
-def load_tracks(folder: Path, runs: pd.DataFrame, columns: Collection[str] | None = None) -> Iterator[Track]:
+def load_tracks(
+    folder: Path, runs: pd.DataFrame, columns: Collection[str] | None = None
+) -> Iterator[Track]:
     """Yield the tracks of those runs that have steps, in their order; with all columns, or those named."""
     try:
         steps = results.load_steps(folder, runs["run_id"].tolist(), columns)
-    except ConfigurationError as error:  # none is kept, or each of these runs ended before its first period
+    except (
+        ConfigurationError
+    ) as error:  # none is kept, or each of these runs ended before its first period
         if type(error) is not ConfigurationError:  # a file is damaged
             raise
         return
@@ -173,7 +196,9 @@ def values_drawn(row: Mapping[Any, Any]) -> dict[str, Any]:
     Raises:
         ConfigurationError: the row has something else.
     """
-    with configuration_errors(f"run {row['run_id']} has mismatch_values that are none: ", TypeError):
+    with configuration_errors(
+        f"run {row['run_id']} has mismatch_values that are none: ", TypeError
+    ):
         return dict(json.loads(row.get("mismatch_values") or "{}"))
 
 
@@ -194,7 +219,9 @@ class Ensemble(Shown):
     """The runs of one controller on one task, a row a seed."""
 
     time: FloatArray  # instants, (k,) [s]
-    error: FloatArray  # norm of the true error, (r, k) [`error_unit`]; infinite from an early end on
+    error: (
+        FloatArray  # norm of the true error, (r, k) [`error_unit`]; infinite from an early end on
+    )
     jacobian_error: FloatArray  # relative, (r, k) [%]; NaN where it is not known
     step_time: FloatArray  # of all steps of the controller, (s,) [µs]
     settling_time: float  # median [s]; infinite if half of the runs never settled
@@ -224,20 +251,29 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
     """Return a quantile over runs, (k,), of values (r, k) of which some may be infinite; NaN counts as the largest."""
     ordered, place = np.sort(values, axis=0), share * (len(values) - 1)
     below, part = math.floor(place), place - math.floor(place)
-    return np.asarray((1.0 - part) * ordered[below] + part * ordered[below + 1] if part else ordered[below])
+    return np.asarray(
+        (1.0 - part) * ordered[below] + part * ordered[below + 1] if part else ordered[below]
+    )
 
 
 def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
-    share = results.read_manifest(folder).get("configuration", {}).get("run", {}).get("camera_moves_at")
+    share = (
+        results.read_manifest(folder).get("configuration", {}).get("run", {}).get("camera_moves_at")
+    )
     share = share if isinstance(share, int | float) and 0.0 <= share < 1.0 else math.nan
     tracks: dict[str, dict[str, list[Track]]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
-        tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(track)
+        tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(
+            track
+        )
     unbegun = runs[(runs["status"] != COMPLETED) & (column_of(runs, "periods") == 0.0)]
     never = unbegun.groupby(["task", "controller"]).size()
     return {
-        task: {name: _ensemble(own, int(never.get((task, name), 0)), share) for name, own in named.items()}
+        task: {
+            name: _ensemble(own, int(never.get((task, name), 0)), share)
+            for name, own in named.items()
+        }
         for task, named in tracks.items()
     }
 
@@ -245,7 +281,11 @@ def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
 def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
     """Return until when a figure shows these runs [s]: a move until well after the slowest method has settled."""
     end = max(float(ensemble.time[-1]) for ensemble in ensembles.values())
-    times = [ensemble.settling_time for ensemble in ensembles.values() if math.isfinite(ensemble.settling_time)]
+    times = [
+        ensemble.settling_time
+        for ensemble in ensembles.values()
+        if math.isfinite(ensemble.settling_time)
+    ]
     moved = [ensemble.camera_moved_at for ensemble in ensembles.values()]
     if not times or not next(iter(ensembles.values())).point_to_point or np.isfinite(moved).any():
         return end
@@ -254,7 +294,10 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
 
 def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> Ensemble:
     """Return the ensemble of tracks and of runs that never began; a camera moves after that share of a run."""
-    runs, longest = pd.DataFrame([track.row for track in tracks]), max(tracks, key=lambda track: len(track.table))
+    runs, longest = (
+        pd.DataFrame([track.row for track in tracks]),
+        max(tracks, key=lambda track: len(track.table)),
+    )
     moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
     known = moves and not math.isnan(camera_moves_at)
     moved_at = float(longest.time[int(camera_moves_at * len(longest.time))]) if known else math.nan

@@ -18,15 +18,26 @@ from servobench.harness.run.result import WrongAnswer
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import REAL, FloatArray
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
+from servobench.plant.contract.signals import (
+    Command,
+    Observation,
+    PlantSpec,
+    Truth,
+    trusted_observation,
+)
 
 PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
-MAX_NAMES, MAX_LETTERS = 256, 100  # of diagnostics in a run, each of which is a column, and of one of their names
+# of diagnostics in a run, each of which is a column, and of one of their names
+MAX_NAMES, MAX_LETTERS = (256, 100)
 
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
     """Return plant and controller such that each raises `WrongAnswer` where it breaks its contract."""
-    held = controller if isinstance(controller, ServoController) else HeldController(controller, plant.spec)
+    held = (
+        controller
+        if isinstance(controller, ServoController)
+        else HeldController(controller, plant.spec)
+    )
     return plant if isinstance(plant, Bench) else HeldPlant(plant), held
 
 
@@ -46,7 +57,9 @@ class HeldController(Controller):
         method = self._controller.reset
         given = _call(method, "reset(self, observation, seed)", _copied(observation), seed)
         if given is not None:
-            raise WrongAnswer(f"reset must return nothing, got {_kind(given)}; keep it in self", method)
+            raise WrongAnswer(
+                f"reset must return nothing, got {_kind(given)}; keep it in self", method
+            )
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`."""
@@ -59,7 +72,10 @@ class HeldController(Controller):
             text = f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)`"
             raise WrongAnswer(f"{text} with {n} joint velocities in rad/s", method)
         if (shape := command.joint_velocity.shape) != (n,):
-            raise WrongAnswer(f"step must return a Command of shape ({n},), one rad/s a joint, got {shape}", method)
+            raise WrongAnswer(
+                f"step must return a Command of shape ({n},), one rad/s a joint, got {shape}",
+                method,
+            )
         return Command(command.joint_velocity)
 
     def diagnostics(self) -> Diagnostics:
@@ -68,10 +84,14 @@ class HeldController(Controller):
         given = _call(method, "diagnostics(self)")
         if not isinstance(given, Mapping):
             text = "diagnostics must return a mapping of names to numbers"
-            raise WrongAnswer(f"{text}, got {_kind(given)}; write `return {{}}` if there are none", method)
+            raise WrongAnswer(
+                f"{text}, got {_kind(given)}; write `return {{}}` if there are none", method
+            )
         for name, value in given.items():
             if type(value) not in PLAIN and not _is_number(value):
-                raise WrongAnswer(f"diagnostics must hold numbers, got {name!r}: {_kind(value)}", method)
+                raise WrongAnswer(
+                    f"diagnostics must hold numbers, got {name!r}: {_kind(value)}", method
+                )
             if not isinstance(name, str) or not name.isprintable() or len(name) > MAX_LETTERS:
                 text = f"diagnostics must have texts of one line and at most {MAX_LETTERS} letters as names, got"
                 raise WrongAnswer(f"{text} {name!r:.{MAX_LETTERS}}", method)
@@ -85,11 +105,15 @@ class HeldController(Controller):
         """See `Controller.estimated_jacobian`."""
         method, wanted = self._controller.estimated_jacobian, (self._spec.m, self._spec.n)
         estimate = _call(method, "estimated_jacobian(self)")
-        if estimate is not None and (not isinstance(estimate, np.ndarray) or estimate.shape != wanted):
+        if estimate is not None and (
+            not isinstance(estimate, np.ndarray) or estimate.shape != wanted
+        ):
             text = f"estimated_jacobian must return an array of shape {wanted} or None"
             raise WrongAnswer(f"{text}, got {_kind(estimate)}", method)
         if estimate is not None and estimate.dtype.kind not in REAL:
-            raise WrongAnswer(f"estimated_jacobian must hold real numbers, got {estimate.dtype}", method)
+            raise WrongAnswer(
+                f"estimated_jacobian must hold real numbers, got {estimate.dtype}", method
+            )
         return None if estimate is None else np.asarray(estimate)
 
 
@@ -118,11 +142,16 @@ class HeldPlant(Plant):
         for name, shape in (("feature", (m,)), ("jacobian", (m, self.spec.n))):
             value = getattr(truth, name)
             if value is not None and np.shape(value) != shape:
-                raise WrongAnswer(f"truth of the plant: {name} must have shape {shape}, got {np.shape(value)}", method)
+                raise WrongAnswer(
+                    f"truth of the plant: {name} must have shape {shape}, got {np.shape(value)}",
+                    method,
+                )
             if value is not None and np.asarray(value).dtype.kind not in REAL:
                 text = f"truth of the plant: {name} must hold real numbers, got {np.asarray(value).dtype}"
                 raise WrongAnswer(text, method)
-        return Truth(_frozen(truth.feature), None if truth.jacobian is None else _frozen(truth.jacobian))
+        return Truth(
+            _frozen(truth.feature), None if truth.jacobian is None else _frozen(truth.jacobian)
+        )
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -132,21 +161,29 @@ class HeldPlant(Plant):
         """See `Plant.close`."""
         self._plant.close()
 
-    def _observation(self, method: Callable[..., Any], signature: str, argument: object) -> Observation:
+    def _observation(
+        self, method: Callable[..., Any], signature: str, argument: object
+    ) -> Observation:
         observation, name = _call(method, signature, argument), signature.partition("(")[0]
         if not isinstance(observation, Observation):
             text = f"{name} of the plant must return an Observation, got {_kind(observation)}"
-            raise WrongAnswer(f"{text}; write `return Observation(time, joint_position, feature)`", method)
+            raise WrongAnswer(
+                f"{text}; write `return Observation(time, joint_position, feature)`", method
+            )
         for what, size in (("joint_position", self.spec.n), ("feature", self.spec.m)):
             shape = getattr(observation, what).shape
             if shape != (size,):
-                raise WrongAnswer(f"{name} of the plant: {what} must have shape ({size},), got {shape}", method)
+                raise WrongAnswer(
+                    f"{name} of the plant: {what} must have shape ({size},), got {shape}", method
+                )
         return _copied(observation)
 
 
 def _copied(observation: Observation) -> Observation:
     """Return an observation whose arrays are its own."""
-    joints, feature, valid = map(_frozen, (observation.joint_position, observation.feature, observation.valid))
+    joints, feature, valid = map(
+        _frozen, (observation.joint_position, observation.feature, observation.valid)
+    )
     return trusted_observation(observation.time, joints, feature, observation.feature_valid, valid)
 
 
@@ -168,7 +205,9 @@ def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any
         return method(*arguments)
     except TypeError as error:
         trace = error.__traceback__
-        if trace is None or trace.tb_next is not None:  # the call was possible, and something behind it was not
+        if (
+            trace is None or trace.tb_next is not None
+        ):  # the call was possible, and something behind it was not
             raise
         raise WrongAnswer(f"{error}; it must be `def {signature}`", method) from None
 

@@ -11,7 +11,9 @@ from servobench.plant.contract.checks import FloatArray
 
 MAX_LAG: Final = 0.5  # [s] of commands and joints
 APART: Final = 1.05  # [1] ratio of the largest speeds of commands and joints, from which they may be clipped elsewhere
-SUSPECT: Final = 0.1  # [1] share of the motion that a drive leaves, from which commands may be mistaken
+SUSPECT: Final = (
+    0.1  # [1] share of the motion that a drive leaves, from which commands may be mistaken
+)
 MAX_LEFT: Final = 0.5  # [1] of the motion of a drive that is told
 SHIFTS: Final = (0.0, 0.1, 0.2, 0.3)  # [s] by which joints may follow their commands
 MIN_ALIKE: Final = 0.7  # [1] correlation of a joint with a command that it follows
@@ -19,7 +21,9 @@ LESS: Final = 0.6  # [1] of it, with its own command
 MIN_MOTION: Final = 0.05  # [rad] of a joint that moves
 MAX_SPEEDS: Final = 20.0  # [1] ratio of commands and joint speeds in one unit
 SAME: Final = 0.1  # [rad] by which commands may be apart from joint positions
-MIN_GAIN: Final = 0.5  # [1] share of the squared errors that another level of clipping leaves at most
+MIN_GAIN: Final = (
+    0.5  # [1] share of the squared errors that another level of clipping leaves at most
+)
 
 
 class Response(NamedTuple):
@@ -46,13 +50,25 @@ def command_response(log: Log) -> Response | None:
 
     def errors(x: FloatArray) -> FloatArray:
         bound = x[2] if len(x) > 2 else limit
-        return (steps - joint_steps(np.clip(logged, -bound, bound), spec.period, *x[:2]))[first:].ravel()
+        return (steps - joint_steps(np.clip(logged, -bound, bound), spec.period, *x[:2]))[
+            first:
+        ].ravel()
 
     def fit(*level: float) -> Any:  # noqa: ANN401 - of SciPy
-        times = [(delay, lag) for delay in np.arange(0.0, 0.2, 0.1 * spec.period) for lag in (0.01, 0.03, 0.1)]
+        times = [
+            (delay, lag)
+            for delay in np.arange(0.0, 0.2, 0.1 * spec.period)
+            for lag in (0.01, 0.03, 0.1)
+        ]
         best = min(times, key=lambda each: float(np.sum(errors(np.array([*each, *level])) ** 2)))
         bounds = [0.0, 1e-4, *np.multiply(0.5, level)], [MAX_LAG, MAX_LAG, *np.multiply(2.0, level)]
-        return least_squares(errors, [*best, *level], bounds=bounds, x_scale=0.01, diff_step=[1e-4] * (2 + len(level)))
+        return least_squares(
+            errors,
+            [*best, *level],
+            bounds=bounds,
+            x_scale=0.01,
+            diff_step=[1e-4] * (2 + len(level)),
+        )
 
     solved, level = fit(), np.inf
     if not 1.0 / APART < np.abs(np.clip(logged, -limit, limit)).max() / reached < APART:
@@ -60,7 +76,9 @@ def command_response(log: Log) -> Response | None:
         if clipped.cost < MIN_GAIN * solved.cost:
             solved = clipped
             level = float(clipped.x[2]) if clipped.x[2] < np.abs(logged).max() else np.inf
-    left, moved, late = (float(np.mean(each**2)) for each in (solved.fun, steps[first:], solved.jac[:, 0]))
+    left, moved, late = (
+        float(np.mean(each**2)) for each in (solved.fun, steps[first:], solved.jac[:, 0])
+    )
     share = math.sqrt(left / moved)
     lost = share > MAX_LEFT or max(solved.x[:2]) > 0.99 * MAX_LAG or late == 0.0
     if lost or (share > SUSPECT and command_mistake(log)):
@@ -76,7 +94,9 @@ def untold_response(log: Log) -> str:
     """Return why a log tells no delay and lag."""
     if log.commands is None:
         return "the log has no command of each joint"
-    return command_mistake(log) or f"none up to {MAX_LAG:g} s explain the joint motion by the commands"
+    return (
+        command_mistake(log) or f"none up to {MAX_LAG:g} s explain the joint motion by the commands"
+    )
 
 
 def command_mistake(log: Log) -> str:
@@ -100,9 +120,17 @@ def command_mistake(log: Log) -> str:
         if moving[i] and size[i, i] < LESS * size[i, j] > LESS * MIN_ALIKE
     ]
     against = moving & (np.diag(least) < -MIN_ALIKE) & (np.diag(most) < LESS * -np.diag(least))
-    found += [f"{name} moves against its command" for name, wrong in zip(names, against, strict=True) if wrong]
+    found += [
+        f"{name} moves against its command"
+        for name, wrong in zip(names, against, strict=True)
+        if wrong
+    ]
     every = "every joint moves against its command" if against.sum() == moving.sum() > 1 else ""
-    return f"{every or ', '.join(found)}; give each joint its own command, in its direction" if found else ""
+    return (
+        f"{every or ', '.join(found)}; give each joint its own command, in its direction"
+        if found
+        else ""
+    )
 
 
 def _correlations(values: FloatArray, others: FloatArray) -> FloatArray:

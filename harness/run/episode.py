@@ -15,7 +15,14 @@ from servobench.harness.config.registry import engine_of
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.contract import held_to_contract
-from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw, naming_the_lack
+from servobench.harness.run.experiment import (
+    Drawn,
+    Experiment,
+    build,
+    build_together,
+    draw,
+    naming_the_lack,
+)
 from servobench.harness.run.knowledge import keep_networks
 from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.log import StepLog, Steps
@@ -38,7 +45,12 @@ def run_experiment(request: RunRequest, settings: Settings, *, steps: bool = Tru
 
 
 def carry_out(
-    resolved: ResolvedRun, *, steps: bool = True, picture: bool = False, keep: Path | None = None, debug: bool = False
+    resolved: ResolvedRun,
+    *,
+    steps: bool = True,
+    picture: bool = False,
+    keep: Path | None = None,
+    debug: bool = False,
 ) -> RunResult:
     """Carry one run out; the row's `status` and `reason` name a fault on the way.
 
@@ -63,7 +75,8 @@ def carry_out(
         except BaseException as error:
             if ends_batch(error) or (debug and not isinstance(error, RunFault)):
                 raise
-            ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row names it
+            # A plug-in may raise anything; the batch goes on and the row names it
+            ending = Ending.of(error)
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
     if keep is not None:
@@ -72,7 +85,9 @@ def carry_out(
     row = _row(experiment.drawn, resolved, ending, _judge(logged, experiment), logged, pose)
     table = None
     if steps:
-        table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(**pose)
+        table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(
+            **pose
+        )
     return RunResult(row, table, image, ending.trace)
 
 
@@ -108,7 +123,9 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
     return _judge_together(runs, many, ends, log.steps())
 
 
-def _judge_together(runs: Sequence[ResolvedRun], many: Experiment, ends: Ends, logged: Steps) -> list[RunResult]:
+def _judge_together(
+    runs: Sequence[ResolvedRun], many: Experiment, ends: Ends, logged: Steps
+) -> list[RunResult]:
     metrics = _judge(logged, many) if len(ends.running) else {}
     columns = {name: values.tolist() for name, values in metrics.items()}
     results = []
@@ -119,7 +136,9 @@ def _judge_together(runs: Sequence[ResolvedRun], many: Experiment, ends: Ends, l
         else:
             ending, values = Ending(), {name: column[lane] for name, column in columns.items()}
         pose = pose_errors(drawn.true, drawn.scenario.reference, own)
-        results.append(RunResult(_row(drawn, run, ending, values, own, pose), None, trace=ending.trace))
+        results.append(
+            RunResult(_row(drawn, run, ending, values, own, pose), None, trace=ending.trace)
+        )
     return results
 
 

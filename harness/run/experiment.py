@@ -25,7 +25,13 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.knowledge import network_source, nominal_knowledge
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.request import RunRequest, RunSettings, find_robot, find_sensing, sensing_file
+from servobench.harness.run.request import (
+    RunRequest,
+    RunSettings,
+    find_robot,
+    find_sensing,
+    sensing_file,
+)
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting, Vector
@@ -49,7 +55,8 @@ from servobench.plant.robot.robot import Robot
 
 ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be under any mismatch
 MAX_PLACE: Final = 20.0  # [m] of a usual target
-RATES: Final = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}  # unit -> usual norms of a Jacobian, in it per rad
+# Unit -> usual norms of a Jacobian, in it per rad
+RATES: Final = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}
 POINTS: Final = 12  # of a curve that are checked
 
 
@@ -58,10 +65,14 @@ class Drawn:
     """The values drawn for one run."""
 
     scenario: Scenario
-    true: RobotModel | None = None  # the true robot and its cameras; None for a plant that brings its own
+    true: RobotModel | None = (
+        None  # the true robot and its cameras; None for a plant that brings its own
+    )
     sample: MismatchSample | None = None  # how it differs from the nominal one
     moved: RobotModel | None = None  # the true robot after its camera was moved; None if it is not
-    cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
+    cameras: CameraDraws | None = (
+        None  # how cameras differ from those planned; None where they are part of `sample`
+    )
 
     @property
     def final(self) -> RobotModel | None:
@@ -71,7 +82,12 @@ class Drawn:
     def as_record(self) -> dict[str, object]:
         """Return all values drawn for robot and cameras, for JSON."""
         parts = (self.sample, self.cameras)
-        return {name: value for part in parts if part is not None for name, value in part.as_record().items()}
+        return {
+            name: value
+            for part in parts
+            if part is not None
+            for name, value in part.as_record().items()
+        }
 
 
 def draw(resolved: ResolvedRun) -> Drawn:
@@ -83,7 +99,9 @@ def draw(resolved: ResolvedRun) -> Drawn:
     request, robot = resolved.request, find_robot(resolved.request.robot)
     true, sample, cameras = draw_robot(request)
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
-    setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
+    setting = TaskSetting(
+        true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal
+    )
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
 
 
@@ -119,21 +137,31 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         with same_folder():
             scenario: object = task.scenario(setting)  # That of a user's task may be anything.
         if not isinstance(scenario, Scenario):
-            raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
+            raise ConfigurationError(
+                f"its method scenario must return a servobench.Scenario, got {scenario!r}"
+            )
         m, times = len(setting.feature.names), np.linspace(0.0, scenario.duration, POINTS)
         points = np.asarray(scenario.reference.at(times))
         if points.shape != (POINTS, m) or not np.isfinite(points).all():
             got = f"shape {points.shape} and {points[:1].tolist()}"
-            raise ConfigurationError(f"its reference must be {m} finite features at {POINTS} instants, got {got}")
+            raise ConfigurationError(
+                f"its reference must be {m} finite features at {POINTS} instants, got {got}"
+            )
         last = (resolved.run.periods(scenario.duration) - 1) * resolved.run.period
-        if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:  # a move is judged by its settling
+        if (
+            scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9
+        ):  # a move is judged by its settling
             part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
             raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
         if name not in TASKS:
-            with configuration_errors("its scenario differs from one call to the next: ", Exception):
+            with configuration_errors(
+                "its scenario differs from one call to the next: ", Exception
+            ):
                 again: Any = task.scenario(setting)
                 starts: list[Any] = [scenario.start, again.start]
-                if not (np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)):
+                if not (
+                    np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)
+                ):
                     raise ConfigurationError("draw from setting.seed alone")
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
@@ -171,7 +199,9 @@ class Experiment:
         """The settings of the loop, with the camera's pose (..., 4, 4) after a move."""
         run, periods = self.run, self.periods
         moved = [each.moved.camera for each in self.runs if each.moved is not None]
-        move = CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
+        move = (
+            CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
+        )
         return LoopSettings(periods, run.preview_rows, run.periods(run.lost_after), move)
 
     def desired(self, periods: int | None = None) -> FloatArray:
@@ -181,7 +211,9 @@ class Experiment:
             (..., periods + preview, m) [unit of the feature].
         """
         rows = (self.periods if periods is None else periods) + self.run.preview_rows
-        return self._in_lanes([each.scenario.reference.sampled(self.plant.spec.period, rows) for each in self.runs])
+        return self._in_lanes(
+            [each.scenario.reference.sampled(self.plant.spec.period, rows) for each in self.runs]
+        )
 
     def _in_lanes(self, arrays: list[FloatArray]) -> FloatArray:
         return np.stack(arrays) if self.together else arrays[0]
@@ -201,17 +233,27 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
     request = resolved.request
     if not find_plant(request.plant).own_robot:
         drawn = draw(resolved)
-        plant, controller, networks = _assemble(resolved, drawn.true, drawn.scenario.start, progress)
+        plant, controller, networks = _assemble(
+            resolved, drawn.true, drawn.scenario.start, progress
+        )
         return Experiment(plant, controller, (drawn,), resolved.run, networks)
     brings = f"plant {request.plant} brings a"
     if request.mismatch != Mismatch():
-        raise ConfigurationError(f"{brings} robot of its own, to which mismatches do not apply; use the mismatch none")
+        raise ConfigurationError(
+            f"{brings} robot of its own, to which mismatches do not apply; use the mismatch none"
+        )
     if request.sensing != DEFAULT_SENSING:
-        raise ConfigurationError(f"{brings} sensor of its own, so the sensing {request.sensing} does not apply")
+        raise ConfigurationError(
+            f"{brings} sensor of its own, so the sensing {request.sensing} does not apply"
+        )
     plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
-        setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
-        return Experiment(plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run, networks)
+        setting = TaskSetting(
+            None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task")
+        )
+        return Experiment(
+            plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run, networks
+        )
     except BaseException:
         plant.close()
         raise
@@ -225,13 +267,19 @@ def build_together(runs: Sequence[ResolvedRun]) -> Experiment:
         Exception: any error of a run alone, or runs that cannot advance together.
     """
     first, drawn = runs[0], tuple(map(draw, runs))
-    robots, starts = stack([each.true for each in drawn]), np.array([each.scenario.start for each in drawn])
+    robots, starts = (
+        stack([each.true for each in drawn]),
+        np.array([each.scenario.start for each in drawn]),
+    )
     plant, controller, networks = _assemble(first, robots, starts)
     return Experiment(plant, controller, drawn, first.run, networks, together=True)
 
 
 def _assemble(
-    resolved: ResolvedRun, true: RobotModel | None, start: FloatArray | None, progress: Progress | None = None
+    resolved: ResolvedRun,
+    true: RobotModel | None,
+    start: FloatArray | None,
+    progress: Progress | None = None,
 ) -> tuple[Plant, Controller, Sequence[TrainedNetworks]]:
     """Return plant, controller and its networks for a true robot and a start (..., n) [rad].
 
@@ -240,26 +288,37 @@ def _assemble(
     """
     request, run, entry = resolved.request, resolved.run, find_plant(resolved.request.plant)
     if request.sensing != DEFAULT_SENSING and not entry.any_sensing:
-        raise ConfigurationError(f"plant {entry.name} has the sensing position only, got {request.sensing}")
+        raise ConfigurationError(
+            f"plant {entry.name} has the sensing position only, got {request.sensing}"
+        )
     robot = None if entry.own_robot else find_robot(request.robot)
     setup = PlantSetup(true, start, run.period, robot)
     with same_folder(), configuration_errors(f"plant {request.plant}: ", RunFault):
         plant = entry.build(resolved.plant, setup)
     if not math.isclose(plant.spec.period, run.period):
         plant.close()
-        raise ConfigurationError(f"plant {request.plant}: spec.period must be that of its setup, {run.period:g} s")
+        raise ConfigurationError(
+            f"plant {request.plant}: spec.period must be that of its setup, {run.period:g} s"
+        )
     try:
         if true is not None and request.mismatch.size("camera_move") > 0.0:
             # Refused where it cannot be moved; a user's camera may lack something before its reset.
-            with contextlib.suppress(AttributeError, TypeError), configuration_errors(f"plant {request.plant}: "):
+            with (
+                contextlib.suppress(AttributeError, TypeError),
+                configuration_errors(f"plant {request.plant}: "),
+            ):
                 plant.move_camera(true.camera)
         if robot is None:
-            trained = knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
+            trained = knowledge = RobotKnowledge(
+                plant.spec, run.preview_rows, plant.nominal_jacobian()
+            )
         else:
             nominal = find_sensing(request.sensing).nominal(robot)
             knowledge, trained = nominal_knowledge(robot, nominal, plant.spec, run)
         source = network_source(trained, progress)
-        true_model = plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
+        true_model = (
+            plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
+        )
         with naming_the_lack(plant, own_robot=robot is None):
             controller = _build_controller(resolved, replace(knowledge, train=source), true_model)
     except BaseException:
@@ -274,7 +333,11 @@ def naming_the_lack(plant: Plant, *, own_robot: bool) -> Iterator[None]:
     try:
         yield
     except (AttributeError, ConfigurationError, TypeError) as error:
-        if own_robot and plant.nominal_jacobian() is None and re.search("NoneType|callable", str(error)):
+        if (
+            own_robot
+            and plant.nominal_jacobian() is None
+            and re.search("NoneType|callable", str(error))
+        ):
             lack = "knowledge.nominal_jacobian is None here: this plant has no model"
             if isinstance(error, ConfigurationError):
                 raise ConfigurationError(f"{error}; {lack}") from error
@@ -316,7 +379,9 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
         for joint, value, lower, upper in limited:
             if not lower <= value <= upper:
                 wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
-                raise ConfigurationError(f"task {run.request.task}: {what} must be {wanted}, got {value:g}")
+                raise ConfigurationError(
+                    f"task {run.request.task}: {what} must be {wanted}, got {value:g}"
+                )
     _check_reach(run, scenario, spec)
 
 
@@ -333,17 +398,27 @@ def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
     speed = np.linalg.norm(np.diff(desired, axis=0), axis=1).max(initial=0.0) / spec.period
     J = true.jacobian(start)
     if speed > (most := float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)):
-        remark(f"{task} moves at {speed:.3g} {unit}/s, and the arm at {most:.3g} {unit}/s at most from its start")
+        remark(
+            f"{task} moves at {speed:.3g} {unit}/s, and the arm at {most:.3g} {unit}/s at most from its start"
+        )
     own = sensing_file(run.request.sensing) is not None
     if own and len(np.unique([*J.round(9), np.zeros(spec.n)], axis=0)) <= spec.m:
-        remark(f"sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start")
+        remark(
+            f"sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start"
+        )
     size, (least, most) = float(np.linalg.norm(J)), RATES.get(unit, (0.0, np.inf))
     if own and not least <= size <= most:
-        remark(f"sensing {run.request.sensing}: features move by {size:.2g} {unit}/rad; is {unit} their unit?")
+        remark(
+            f"sensing {run.request.sensing}: features move by {size:.2g} {unit}/rad; is {unit} their unit?"
+        )
 
 
 def train_networks(
-    controller: str, settings: Settings, progress: Progress, robot_name: str, sensing: str = DEFAULT_SENSING
+    controller: str,
+    settings: Settings,
+    progress: Progress,
+    robot_name: str,
+    sensing: str = DEFAULT_SENSING,
 ) -> TrainedNetworks:
     """Return the networks that a controller of this name starts from, trained where the cache has none.
 
@@ -352,12 +427,20 @@ def train_networks(
     """
     robot = find_robot(robot_name)
     if not robot.known:
-        raise ConfigurationError(f"networks are trained on a nominal model, and controllers know none of {robot.title}")
-    request = RunRequest("kinematic", controller, "target", Mismatch(), 0, robot=robot_name, sensing=sensing)
+        raise ConfigurationError(
+            f"networks are trained on a nominal model, and controllers know none of {robot.title}"
+        )
+    request = RunRequest(
+        "kinematic", controller, "target", Mismatch(), 0, robot=robot_name, sensing=sensing
+    )
     resolved = resolve(request, settings)  # networks do not depend on plant and task
-    for section, key, text in settings.assigned if isinstance(resolved.controller, TrainedMethodConfig) else ():
+    for section, key, text in (
+        settings.assigned if isinstance(resolved.controller, TrainedMethodConfig) else ()
+    ):
         if (section, key.partition(".")[0]) != (controller, "training"):
-            raise ConfigurationError(f"--set {text} has no effect: networks depend on {controller}.training alone")
+            raise ConfigurationError(
+                f"--set {text} has no effect: networks depend on {controller}.training alone"
+            )
     experiment = build(resolved, progress=progress)
     experiment.plant.close()
     if not experiment.networks:
@@ -374,7 +457,9 @@ def _equations(model: RobotModel) -> TrueModel:
     return TrueModel(TrueJacobian(model), symbolic)
 
 
-def _build_controller(run: ResolvedRun, knowledge: RobotKnowledge, true_model: Callable[[], TrueModel]) -> Controller:
+def _build_controller(
+    run: ResolvedRun, knowledge: RobotKnowledge, true_model: Callable[[], TrueModel]
+) -> Controller:
     """Build a controller; the truth goes only to one that asks for it, as the nominal model where there is none."""
     entry = find_controller(run.request.controller)
     with configuration_errors(f"controller {run.request.controller}: "):
@@ -385,13 +470,20 @@ def _build_controller(run: ResolvedRun, knowledge: RobotKnowledge, true_model: C
                 nominal_jacobian=knowledge.nominal_jacobian or true.jacobian,
                 true_jacobian=true.jacobian,
                 true_symbolic=true.symbolic,
-                true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0, true.latency_spread),
+                true_delays=Delays(
+                    true.latency, true.command_delay, true.lag or 0.0, true.latency_spread
+                ),
                 true_camera_turn=true.camera_turn,
                 true_tool=true.tool,
             )
         frozen = getattr(type(run.controller), "__dataclass_params__", None)
-        mine = run.controller if frozen is not None and frozen.frozen else copy.deepcopy(run.controller)
-        return entry.build(mine, knowledge)  # runs share the settings, which a class of a user's may change
+        mine = (
+            run.controller
+            if frozen is not None and frozen.frozen
+            else copy.deepcopy(run.controller)
+        )
+        # Runs share the settings, which a class of a user's may change
+        return entry.build(mine, knowledge)
 
 
 def _check_times(resolved: ResolvedRun, duration: float) -> None:
@@ -399,7 +491,9 @@ def _check_times(resolved: ResolvedRun, duration: float) -> None:
     plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
     whole = f"the run of {duration:g} s"
     times = {"run.period": resolved.run.period}
-    times |= {f"{plant}.{name}": getattr(resolved.plant, name, 0.0) for name in ("command_delay", "lag")}
+    times |= {
+        f"{plant}.{name}": getattr(resolved.plant, name, 0.0) for name in ("command_delay", "lag")
+    }
     if isinstance(sensing, SensingConfig):
         names = ("latency", "jitter", "frame_period", "latency_swing")
         times |= {f"{plant}.sensing.{name}": getattr(sensing, name) for name in names}
@@ -412,7 +506,9 @@ def _check_times(resolved: ResolvedRun, duration: float) -> None:
             raise ConfigurationError(f"{name} must be shorter than {whole}, got {time:g} s{meant}")
     preview = resolved.run.preview_time
     if preview > max(duration, RunSettings().preview_time):
-        raise ConfigurationError(f"run.preview_time must be no longer than {whole}, got {preview:g} s")
+        raise ConfigurationError(
+            f"run.preview_time must be no longer than {whole}, got {preview:g} s"
+        )
 
 
 def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
@@ -428,15 +524,23 @@ def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
     with configuration_errors(f"{resolved.request.plant}."):
         extents = sensing.extents(unit, scale)
     for name, metres in extents._asdict().items():
-        given, size, place = getattr(sensing, name), scale * metres, f"{resolved.request.plant}.sensing.{name}"
+        given, size, place = (
+            getattr(sensing, name),
+            scale * metres,
+            f"{resolved.request.plant}.sensing.{name}",
+        )
         if unit not in ("px", "m") or size <= (1.0 if name == "outlier_size" else 0.1) * whole:
             continue
         plain = given == metres
         words = f"{place} is {size:.4g} {unit}, above a tenth of {whole:g} {unit}"
         if plain and unit == "px":
-            raise ConfigurationError(f"{words}: a plain number is in metres; for pixels write {given:g}px")
+            raise ConfigurationError(
+                f"{words}: a plain number is in metres; for pixels write {given:g}px"
+            )
         if size > whole:
-            raise ConfigurationError(words + likely_meant(metres, "m", lambda other: other <= 0.1 * whole) * plain)
+            raise ConfigurationError(
+                words + likely_meant(metres, "m", lambda other: other <= 0.1 * whole) * plain
+            )
         remark(words)
 
 
@@ -444,7 +548,9 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     """Refuse a target or a curve that no true robot of the run's mismatch can reach, by its farthest point."""
     task, robot = resolved.request.task, find_robot(resolved.request.robot)
     taught = not resolved.task.any_robot  # on the true robot
-    if find_task(task).out_of_reach or taught or resolved.request.sensing != DEFAULT_SENSING:  # not all are positions
+    if (
+        find_task(task).out_of_reach or taught or resolved.request.sensing != DEFAULT_SENSING
+    ):  # not all are positions
         return
     nominal, times = robot.nominal, np.linspace(0.0, scenario.duration, POINTS)
     points = np.unique(scenario.reference.at(times), axis=0)
@@ -452,9 +558,13 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     distances = np.array(_distances(nominal, tuple(map(tuple, points)), *limits))
     beyond = distances - _room(resolved.request.mismatch, robot, nominal.to_base(points))
     worst = int(beyond.argmax())
-    centre = float(np.linalg.norm(nominal.to_base(points) - robot.workspace.shoulder, axis=-1).min())
+    centre = float(
+        np.linalg.norm(nominal.to_base(points) - robot.workspace.shoulder, axis=-1).min()
+    )
     if centre < 0.5 * robot.workspace.reach[0]:
-        remark(f"task {task}: a target {1e3 * centre:.0f} mm from the arm's shoulder is within the arm itself")
+        remark(
+            f"task {task}: a target {1e3 * centre:.0f} mm from the arm's shoulder is within the arm itself"
+        )
     if beyond[worst] > 0.0:
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
         on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]
@@ -465,9 +575,13 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
 
 
 @lru_cache(maxsize=64)
-def _distances(nominal: HandEyeModel, points: tuple[Vector, ...], lower: Vector, upper: Vector) -> Vector:
+def _distances(
+    nominal: HandEyeModel, points: tuple[Vector, ...], lower: Vector, upper: Vector
+) -> Vector:
     """Return how near the nominal arm comes to each point [m]."""
-    found = closest_distance(nominal.arm, nominal.to_base(np.array(points)), np.array(lower), np.array(upper))
+    found = closest_distance(
+        nominal.arm, nominal.to_base(np.array(points)), np.array(lower), np.array(upper)
+    )
     return tuple(found.tolist())
 
 
@@ -479,7 +593,11 @@ def _room(mismatch: Mismatch, robot: Robot, points: FloatArray) -> FloatArray:
     length = float(np.linalg.norm(robot.arm.translation, axis=-1).sum())
     arm = ROOM + length * mismatch.size("links") + math.sqrt(3.0) * mismatch.size("tool")
     turn = min(math.pi, mismatch.size("camera_rotation") + mismatch.size("camera_move"))
-    turned = 2.0 * math.sin(turn / 2.0) * np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
+    turned = (
+        2.0
+        * math.sin(turn / 2.0)
+        * np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
+    )
     return np.asarray(arm + turned)
 
 
@@ -501,7 +619,9 @@ def try_to_build(word: str, name: str, robot_name: str) -> None:
     setup = PlantSetup(None, None, period) if entry.own_robot else None
     setup = setup or PlantSetup(robot.nominal, robot.workspace.home, period, robot)
     with configuration_errors(f"plant {name}: "), contextlib.suppress(RunFault):
-        plant = entry.build(entry.config() if entry.config_for is None else entry.config_for(robot), setup)
+        plant = entry.build(
+            entry.config() if entry.config_for is None else entry.config_for(robot), setup
+        )
         with contextlib.suppress(Exception):  # `servobench check plant` reports it
             plant.close()
 

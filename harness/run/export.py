@@ -60,27 +60,48 @@ def controller_model(request: RunRequest, settings: Settings) -> ControllerModel
     """
     entry = find_controller(request.controller)
     if entry.needs_truth:
-        raise ConfigurationError(f"controller {entry.name!r} cannot be exported: it is given the true robot")
+        raise ConfigurationError(
+            f"controller {entry.name!r} cannot be exported: it is given the true robot"
+        )
     resolved = resolve(request, settings)
     experiment = build(resolved)
     with closing(experiment.plant):
         return _model(entry, resolved, experiment)
 
 
-def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment) -> ControllerModel:
-    controller, spec, name = experiment.controller, experiment.plant.spec, f"controller {entry.name!r}"
+def _model(
+    entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
+) -> ControllerModel:
+    controller, spec, name = (
+        experiment.controller,
+        experiment.plant.spec,
+        f"controller {entry.name!r}",
+    )
     if not isinstance(controller, ServoController):
-        raise ConfigurationError(f"{name} cannot be exported: it is not composed of an estimator and a law")
+        raise ConfigurationError(
+            f"{name} cannot be exported: it is not composed of an estimator and a law"
+        )
     if not controller.servo.initial.immediate:
         remedy = "set initial.source to nominal or given"
-        raise ConfigurationError(f"{name} cannot be exported while it probes its initial Jacobian: {remedy}")
+        raise ConfigurationError(
+            f"{name} cannot be exported while it probes its initial Jacobian: {remedy}"
+        )
     groups = controller_groups(spec.n, spec.m, 1 + experiment.run.preview_rows, spec.feature_unit)
     shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
-    shapes |= {each.name: (each.shape, "b" if each.name == SEEN else "f") for each in groups if each.role == INPUT}
+    shapes |= {
+        each.name: (each.shape, "b" if each.name == SEEN else "f")
+        for each in groups
+        if each.role == INPUT
+    }
     columns, states = _run(experiment)
-    inputs, outputs = (np.column_stack([columns[each] for each in names]) for names in (shapes, (COMMAND, JACOBIAN)))
+    inputs, outputs = (
+        np.column_stack([columns[each] for each in names])
+        for names in (shapes, (COMMAND, JACOBIAN))
+    )
     try:
-        recorded = record(controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes)
+        recorded = record(
+            controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes
+        )
         kept = _repeated_periods(recorded, inputs, outputs, states)
     except NotTraceable as error:
         sensing = resolved.request.sensing
@@ -93,11 +114,15 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
         groups=groups,
         period=spec.period,
         run={each: rows[:kept] for each, rows in columns.items()},
-        settings="\n".join(f"{key} = {value}" for key, value in flatten(resolved.controller).items()),
+        settings="\n".join(
+            f"{key} = {value}" for key, value in flatten(resolved.controller).items()
+        ),
     )
 
 
-def _repeated_periods(recorded: Recorded, inputs: FloatArray, outputs: FloatArray, states: list[FloatArray]) -> int:
+def _repeated_periods(
+    recorded: Recorded, inputs: FloatArray, outputs: FloatArray, states: list[FloatArray]
+) -> int:
     """Return for how many periods the recorded step repeats a run.
 
     Learning may magnify rounding errors without bound. Then short stretches are compared, each from the state of the
@@ -120,10 +145,15 @@ def _repeated_periods(recorded: Recorded, inputs: FloatArray, outputs: FloatArra
     if whole.max() <= TOLERANCE:
         return len(whole)
     # Rounding errors take longer to grow than the first stretch.
-    for largest, most in ((whole[:STRETCH].max(), 0.1 * TOLERANCE), (differences(STRETCH).max(), TOLERANCE)):
+    for largest, most in (
+        (whole[:STRETCH].max(), 0.1 * TOLERANCE),
+        (differences(STRETCH).max(), TOLERANCE),
+    ):
         if not largest <= most:
             allowed = f"allowed is {most:.0g}: take another method, sensing or robot"
-            raise NotTraceable(f"over {STRETCH} periods it would differ from the original by {largest:.1g}, {allowed}")
+            raise NotTraceable(
+                f"over {STRETCH} periods it would differ from the original by {largest:.1g}, {allowed}"
+            )
     return int(np.argmin(whole <= 0.1 * TOLERANCE))
 
 
@@ -133,7 +163,9 @@ def _observation(inputs: Mapping[str, Any]) -> Observation:
     return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
 
 
-def _step(servo: Servo, state: ServoState, inputs: Mapping[str, Any]) -> tuple[ServoState, FloatArray]:
+def _step(
+    servo: Servo, state: ServoState, inputs: Mapping[str, Any]
+) -> tuple[ServoState, FloatArray]:
     """Return the new state, and command and Jacobian in one row."""
     state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
     jacobian = servo.jacobian(state)
@@ -157,20 +189,36 @@ def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray
     try:
         for period in islice(periods(rollout, controller), REFERENCE_PERIODS):
             observation, estimate = period.observation, controller.estimated_jacobian()
-            given = observation.joint_position, observation.feature, observation.valid, np.ravel(period.reference)
-            answers = period.command.joint_velocity, np.ravel(unknown if estimate is None else estimate)
+            given = (
+                observation.joint_position,
+                observation.feature,
+                observation.valid,
+                np.ravel(period.reference),
+            )
+            answers = (
+                period.command.joint_velocity,
+                np.ravel(unknown if estimate is None else estimate),
+            )
             rows.append((observation.time, *given, *answers))
             if len(rows) % STRETCH == 0:
                 states.append(np.hstack([*map(np.ravel, leaves_of(controller.save()))]))
     except RunFault as fault:
         if not rows:
-            raise ConfigurationError(f"the run that is kept inside the FMU failed at once: {fault}") from fault
+            raise ConfigurationError(
+                f"the run that is kept inside the FMU failed at once: {fault}"
+            ) from fault
     columns = (np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
-    return dict(zip(("time", POSITION, FEATURE, SEEN, REFERENCE, COMMAND, JACOBIAN), columns, strict=True)), states
+    return dict(
+        zip(("time", POSITION, FEATURE, SEEN, REFERENCE, COMMAND, JACOBIAN), columns, strict=True)
+    ), states
 
 
 def arm_product(
-    request: RunRequest, words: str, fmi: int = 2, own: PlantSetup | None = None, config: KinematicConfig = USUAL
+    request: RunRequest,
+    words: str,
+    fmi: int = 2,
+    own: PlantSetup | None = None,
+    config: KinematicConfig = USUAL,
 ) -> Product:
     """Return the true arm of a run ready for export, with `words` on its mismatch.
 
@@ -181,7 +229,9 @@ def arm_product(
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
     moves = ["camera_move"] * (request.mismatch.size("camera_move") > 0.0)
-    for part, _, name in (each.rpartition(".") for each in [*request.mismatch.plant_settings, *moves]):
+    for part, _, name in (
+        each.rpartition(".") for each in [*request.mismatch.plant_settings, *moves]
+    ):
         remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
         raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
     true, *_ = draw_robot(request)
@@ -203,10 +253,14 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
     for key in sorted(sections.given.get(request.plant, ())):
         if key.partition(".")[0] not in ("lag", "max_joint_speed", "joint_range", "mechanics"):
             has = "lag, limits and mechanics, and is seen without noise and latency and commanded a period later"
-            raise ConfigurationError(f"the arm of an SSP has {has}: leave {request.plant}.{key} out")
+            raise ConfigurationError(
+                f"the arm of an SSP has {has}: leave {request.plant}.{key} out"
+            )
     scenario, run, config = draw(resolved).scenario, resolved.run, resolved.plant
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
-    arm = KinematicConfig(config.max_joint_speed, config.joint_range, config.lag, mechanics=config.mechanics)
+    arm = KinematicConfig(
+        config.max_joint_speed, config.joint_range, config.lag, mechanics=config.mechanics
+    )
     setup = PlantSetup(None, scenario.start, run.period, find_robot(request.robot))
     plant = arm_product(request, f"{request.mismatch}, seed {request.seed}", 2, setup, arm)
     controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})

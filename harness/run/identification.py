@@ -54,7 +54,9 @@ ARM: Final = ("gear", "zero", "link", "tool")
 MAX_OFF_TURN: Final = 1.0  # [rad] by which the jump of a wrapped joint is no turn
 JUMP_SPEED: Final = 1.5  # [1] of the speed limit of a joint, and
 JUMP_STEP: Final = 0.05  # [rad] in addition, beyond which a motion from row to row is a jump
-CHANGE: Final = 2.5  # [1] of the least change of a feature, such as one pixel, beyond which a change is large
+CHANGE: Final = (
+    2.5  # [1] of the least change of a feature, such as one pixel, beyond which a change is large
+)
 MAX_REPEATED: Final = 0.01  # [1] share of frames that equal another one although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
@@ -87,7 +89,9 @@ class Log(NamedTuple):
         q, lower, upper = self.joints, self.spec.joint_lower, self.spec.joint_upper
         beyond = np.maximum(q - upper, lower - q)
         row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
-        place = f"row {row} of the log has {self.spec.joint_names[joint]} at {q[row, joint]:.4g} rad"
+        place = (
+            f"row {row} of the log has {self.spec.joint_names[joint]} at {q[row, joint]:.4g} rad"
+        )
         limits = f"{lower[joint]:.4g} to {upper[joint]:.4g} rad"
         return float(beyond[row, joint]), f"{place}, beyond its range of {limits}"
 
@@ -101,7 +105,10 @@ class Log(NamedTuple):
 
     def first_jump(self) -> tuple[str, bool]:
         """Return where a joint moves far beyond its speed, by a turn if one does, with the remedy; and if by a turn."""
-        jumps, limits = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1])), self.spec.joint_velocity_limit
+        jumps, limits = (
+            np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1])),
+            self.spec.joint_velocity_limit,
+        )
         beyond = np.argwhere(jumps > JUMP_SPEED * limits * self.spec.period + JUMP_STEP).tolist()
         if not beyond:
             return "", False
@@ -110,25 +117,40 @@ class Log(NamedTuple):
         where = f"joint {self.spec.joint_names[joint]} jumps by {jumps[row, joint]:.4g} rad in row {row}"
         if turns[row, joint]:
             return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)", True
-        return f"{where}, above {limits[joint]:.3g} rad/s: interpolate lost or held positions, or cut there", False
+        return (
+            f"{where}, above {limits[joint]:.3g} rad/s: interpolate lost or held positions, or cut there",
+            False,
+        )
 
     def frame_mistake(self) -> str:
         """Name frames given as new that equal the one before, or are all the same, although the arm moves."""
         rows = frames_of(self)
-        _, kinds, counts = np.unique(self.features[rows], axis=0, return_inverse=True, return_counts=True)
+        _, kinds, counts = np.unique(
+            self.features[rows], axis=0, return_inverse=True, return_counts=True
+        )
         steps = np.diff(self.features[rows], axis=0)
         moves = steps[changed := steps.any(axis=1)]
-        large = (np.abs(moves) > CHANGE * np.abs(moves).min(axis=0, initial=np.inf, where=moves != 0.0)).any(axis=1)
-        jumps = np.append(False, large) | np.append(large, True)  # large changes before or after equal frames
-        back = np.linalg.norm(moves[:-1] + moves[1:], axis=1) < 0.5 * np.linalg.norm(moves[1:], axis=1)
-        often = (counts > max(2, MAX_REPEATED * len(rows)))[kinds[1:]]  # as 0 stands for no frame, but not in laps
+        large = (
+            np.abs(moves) > CHANGE * np.abs(moves).min(axis=0, initial=np.inf, where=moves != 0.0)
+        ).any(axis=1)
+        # Large changes before or after equal frames
+        jumps = np.append(False, large) | np.append(large, True)
+        back = np.linalg.norm(moves[:-1] + moves[1:], axis=1) < 0.5 * np.linalg.norm(
+            moves[1:], axis=1
+        )
+        # As 0 stands for no frame, but not in laps
+        often = (counts > max(2, MAX_REPEATED * len(rows)))[kinds[1:]]
         since = np.cumsum(changed)  # changes so far, which equal frames share
         same = (~changed | (often & np.pad(back, 1)[since])) & jumps[since]
         moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
         if not moving.any() or (share := float(np.mean(same[moving]))) <= MAX_REPEATED:
             return ""
-        found = f"{share:.0%} of the frames repeat another one although the arm moves, first in row "
-        return f"{found}{rows[1:][same & moving][0]}: give rows without a new frame feature_valid = 0"
+        found = (
+            f"{share:.0%} of the frames repeat another one although the arm moves, first in row "
+        )
+        return (
+            f"{found}{rows[1:][same & moving][0]}: give rows without a new frame feature_valid = 0"
+        )
 
 
 def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:
@@ -141,17 +163,27 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     frames = table.filter(names["feature"])
     lost = frames.isna().all(axis=1)  # as a log may write a row without a new frame
     table = table.assign(**frames.where(~lost, frames.ffill().bfill(), axis=0))
-    joints, features = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
-    told = numbers_of(LOG, table, ["feature_valid"])[:, 0] if "feature_valid" in table else np.ones(len(rows))
+    joints, features = (
+        numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature")
+    )
+    told = (
+        numbers_of(LOG, table, ["feature_valid"])[:, 0]
+        if "feature_valid" in table
+        else np.ones(len(rows))
+    )
     valid = (told != 0.0) & ~lost.to_numpy()
     lacking = [name for name in names[COMMAND] if name not in table]
     if lacking and any(str(name).startswith(VELOCITY) for name in table):
-        remark(f"the log has columns {VELOCITY}_… but no {', '.join(lacking)}: commands are left out")
+        remark(
+            f"the log has columns {VELOCITY}_… but no {', '.join(lacking)}: commands are left out"
+        )
     commands = None if lacking else numbers_of(LOG, table, names[COMMAND])
     log = Log(spec, np.asarray(spec.period * rows), joints, features, valid, commands)
     if (count := len(frames_of(log))) < least:
         after = f"after the first {MAX_LATENCY:g} s"
-        raise ConfigurationError(f"the log has {count} valid frames {after}; wanted {least} or more")
+        raise ConfigurationError(
+            f"the log has {count} valid frames {after}; wanted {least} or more"
+        )
     return log
 
 
@@ -187,7 +219,9 @@ class Identified:
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; 0 and infinite for one that the log does not have."""
         where = [k for k, own in enumerate(self.names) if own == name]
-        return next(((float(self.values[k]), float(self.deviations[k])) for k in where), (0.0, np.inf))
+        return next(
+            ((float(self.values[k]), float(self.deviations[k])) for k in where), (0.0, np.inf)
+        )
 
     def sizes(self) -> dict[str, float]:
         """Return gears, zeros, links and tool by name, in deviations of their priors."""
@@ -200,7 +234,9 @@ class Identified:
 
     def rates(self, log: Log) -> FloatArray:
         """Return how fast the features of these frames move, (k, m), 1/s."""
-        return np.asarray(np.gradient(log.features[self.rows] - self.residuals, log.time[self.rows], axis=0))
+        return np.asarray(
+            np.gradient(log.features[self.rows] - self.residuals, log.time[self.rows], axis=0)
+        )
 
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
@@ -232,22 +268,37 @@ class _Problem:
     def __init__(self, log: Log, model: RobotModel, most: int, begin: Mapping[str, float]) -> None:
         self.rows = frames_of(log, most)
         self.time, self.y = log.time[self.rows], log.features[self.rows]
-        self.motion, self.log, self.middle = CubicSpline(log.time, log.joints), log, float(log.time.mean())
+        self.motion, self.log, self.middle = (
+            CubicSpline(log.time, log.joints),
+            log,
+            float(log.time.mean()),
+        )
         pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
         lens: tuple[str, ...] = () if pixels else LENS
-        self.names = tuple(each for each in parameter_names(model.arm) if each not in ("command_delay", "lag", *lens))
+        self.names = tuple(
+            each
+            for each in parameter_names(model.arm)
+            if each not in ("command_delay", "lag", *lens)
+        )
         self.names += EXTRAS[:5] if pixels else EXTRAS
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model, self.pace, model = model, 1.0, deviated(model, begin)
-        self._last: tuple[Any, Any] = None, None  # z, pace and model of the last errors, and values computed for them
+        # Z, pace and model of the last errors, and values computed for them
+        self._last: tuple[Any, Any] = (None, None)
         latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
-        self.spread, latency, turning, pose = self._placed(model, latencies, np.zeros_like(latencies))
+        self.spread, latency, turning, pose = self._placed(
+            model, latencies, np.zeros_like(latencies)
+        )
         if not pixels:
-            self.spread, _, turning, pose = self._placed(model, np.full(len(TURNINGS), latency), TURNINGS)
+            self.spread, _, turning, pose = self._placed(
+                model, np.full(len(TURNINGS), latency), TURNINGS
+            )
         found = {**begin, "latency": latency, "turning": turning}
-        self.z = np.array([found.get(name, 0.0) for name in self.names]) / self.scale * ~self._of_camera
+        self.z = (
+            np.array([found.get(name, 0.0) for name in self.names]) / self.scale * ~self._of_camera
+        )
         self.model = self.model.with_camera(pose)
 
     def _placed(
@@ -270,14 +321,24 @@ class _Problem:
         swings = np.any([values["swing_sin"], values["swing_cos"]])
         for _ in range(8 if swings else 0):  # the swing is that at the exposure
             phase = self.pace * time
-            time = steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
+            time = (
+                steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
+            )
         ripple, backlash = (np.expand_dims(values[name], -1) for name in ("ripple", "backlash"))
-        return time, transmitted(self.motion(time), ripple, RIPPLE_ORDER) + backlash * self.play(time)
+        return time, transmitted(self.motion(time), ripple, RIPPLE_ORDER) + backlash * self.play(
+            time
+        )
 
-    def _seen(self, model: RobotModel, values: Mapping[str, float], time: FloatArray, ball: FloatArray) -> FloatArray:
+    def _seen(
+        self, model: RobotModel, values: Mapping[str, float], time: FloatArray, ball: FloatArray
+    ) -> FloatArray:
         """Return h, (..., k, m), by the camera of a model for the ball in the base frame, (..., k, 3) m."""
         own: Any = model
-        y = own.feature_at(ball[..., None, :]) if isinstance(model, SetupModel) else own.to_camera(ball)
+        y = (
+            own.feature_at(ball[..., None, :])
+            if isinstance(model, SetupModel)
+            else own.to_camera(ball)
+        )
         if "turning" in values:
             y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
         return np.asarray(y)
@@ -300,19 +361,26 @@ class _Problem:
         seen = self._seen(model, values, time, ball)
         # A turned or moved camera sees what the other one would of a ball that moves the other way.
         pose, turn, steps = model.camera, [values[name] for name in CAMERA[:3]], STEP * np.eye(3)
-        back, lever = pose[:3, :3] @ (self.model.camera[:3, :3] @ rotation_matrix(turn + steps)).mT, ball - pose[:3, 3]
+        back, lever = (
+            pose[:3, :3] @ (self.model.camera[:3, :3] @ rotation_matrix(turn + steps)).mT,
+            ball - pose[:3, 3],
+        )
         motions |= dict(zip(CAMERA, (*(lever @ back.mT - lever) / STEP, *-np.eye(3)), strict=True))
         moved = self._seen(model, values, time, ball + steps[:, None])
         by_ball = np.stack([*(moved - seen)], axis=-1) / STEP
         rates = {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
         sizes = STEP * np.diag([prior(name) for name in EXPOSURE])[..., None]
-        then, joints = self._exposed(values | {name: values[name] + s for name, s in zip(EXPOSURE, sizes, strict=True)})
+        then, joints = self._exposed(
+            values | {name: values[name] + s for name, s in zip(EXPOSURE, sizes, strict=True)}
+        )
         found = self._seen(model, values, then, ball + np.matvec(by_joint, joints - q))
         rates |= dict(zip(EXPOSURE, (found - seen) / STEP, strict=True))
         for name in set(self.names) - set(rates):
             other, eye = {**values, name: values[name] + STEP * prior(name)}, model
             if name in LENS:
-                eye = self.model.with_camera(pose).with_lens(np.array([other[each] for each in LENS]))
+                eye = self.model.with_camera(pose).with_lens(
+                    np.array([other[each] for each in LENS])
+                )
             rates[name] = (self._seen(eye, other, time, ball) - seen) / STEP
         return -np.stack([rates[name] for name in self.names])
 
@@ -349,9 +417,14 @@ class _Problem:
         weight = np.sqrt(weight / (1.0 + (late / np.median(np.abs(late))) ** 2))
         found: list[tuple[float, float, list[float]]] = []
         for pace in 2.0 * np.pi / SWINGS[np.ptp(self.time) > SWINGS_IN_LOG * SWINGS]:
-            waves = np.stack([np.sin(pace * self.time), np.cos(pace * self.time)], axis=1) * weight[:, None]
+            waves = (
+                np.stack([np.sin(pace * self.time), np.cos(pace * self.time)], axis=1)
+                * weight[:, None]
+            )
             sizes = np.linalg.lstsq(waves, late * weight, rcond=None)[0]
-            found.append((float(np.sum((late * weight - waves @ sizes) ** 2)), pace, sizes.tolist()))
+            found.append(
+                (float(np.sum((late * weight - waves @ sizes) ** 2)), pace, sizes.tolist())
+            )
         _, self.pace, sizes = min(found, default=(0.0, self.pace, [0.0, 0.0]))
         z[swings] = np.array(sizes) / prior("swing")
         return z
@@ -377,7 +450,9 @@ def played(joints: FloatArray, size: float) -> FloatArray:
     return behind - joints
 
 
-def fit_cameras(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+def fit_cameras(
+    model: RobotModel, joints: FloatArray, features: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return robust poses of a fixed camera, (s, 4, 4), and the median of the errors of each [unit of the feature].
 
     Args:
@@ -390,23 +465,35 @@ def fit_cameras(model: RobotModel, joints: FloatArray, features: FloatArray) -> 
     most = max(1, ROWS_AT_ONCE // joints.shape[1])
     fit: Any = _by_pixels if pixels else _by_places
     starts = range(0, len(joints), most)
-    poses, errors = zip(*(fit(model, joints[k : k + most], features[k : k + most]) for k in starts), strict=True)
+    poses, errors = zip(
+        *(fit(model, joints[k : k + most], features[k : k + most]) for k in starts), strict=True
+    )
     return np.concatenate(poses), np.concatenate(errors)
 
 
-def _by_pixels(model: SetupModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _by_pixels(
+    model: SetupModel, joints: FloatArray, features: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     import cv2  # noqa: PLC0415 - a tenth of a second
 
-    matrix, poses, errors = np.eye(3), np.tile(np.eye(4), (len(joints), 1, 1)), np.zeros(len(joints))
+    matrix, poses, errors = (
+        np.eye(3),
+        np.tile(np.eye(4), (len(joints), 1, 1)),
+        np.zeros(len(joints)),
+    )
     matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
-    wide = model.optics.further is not None and model.optics.further.shape[-1] > COLUMNS["plumb_bob"]
+    wide = (
+        model.optics.further is not None and model.optics.further.shape[-1] > COLUMNS["plumb_bob"]
+    )
     for k, (q, y) in enumerate(zip(joints, features, strict=True)):
         points = np.ascontiguousarray(model.points(q)[:, 0])
         flat = y.copy()
         if wide:
             rays = locate(y[:, None, None], np.ones((len(y), 1, 1)), model.optics)[:, 0, 0]
             flat = np.ascontiguousarray((rays @ matrix.T)[:, :2])
-        found, turn, place, _ = cv2.solvePnPRansac(points, flat, matrix, None, reprojectionError=20.0)
+        found, turn, place, _ = cv2.solvePnPRansac(
+            points, flat, matrix, None, reprojectionError=20.0
+        )
         if found:
             poses[k, :3, :3], poses[k, :3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
         poses[k] = np.linalg.inv(poses[k]) if found else model.camera
@@ -414,7 +501,9 @@ def _by_pixels(model: SetupModel, joints: FloatArray, features: FloatArray) -> t
     return poses, errors
 
 
-def _by_places(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _by_places(
+    model: RobotModel, joints: FloatArray, features: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     points, poses = model.arm.ball_position(joints), np.tile(np.eye(4), (len(joints), 1, 1))
     weights = np.ones(points.shape[:2])
     for _ in range(5):  # Kabsch's rotation with the weights of Weiszfeld's median
@@ -430,7 +519,11 @@ def _by_places(model: RobotModel, joints: FloatArray, features: FloatArray) -> t
 
 
 def identify(
-    log: Log, model: RobotModel, most: int = MAX_FRAMES, fits: int = FITS, begin: Mapping[str, float] | None = None
+    log: Log,
+    model: RobotModel,
+    most: int = MAX_FRAMES,
+    fits: int = FITS,
+    begin: Mapping[str, float] | None = None,
 ) -> Identified:
     """Identify a robot from a log.
 
@@ -445,12 +538,17 @@ def identify(
         ConfigurationError: another sensing.
     """
     sensing = model.setup.name if isinstance(model, SetupModel) else POSITION.name
-    if sensing not in (POSITION.name, PIXEL.name) or (isinstance(model, SetupModel) and model.mount != "fixed"):
+    if sensing not in (POSITION.name, PIXEL.name) or (
+        isinstance(model, SetupModel) and model.mount != "fixed"
+    ):
         wanted = "logs with --sensing position or pixel, of a fixed camera"
         raise ConfigurationError(f"identify takes {wanted}; got {sensing}")
     problem = _Problem(log, model, most, begin or {})
     inliers = np.ones(len(problem.rows), dtype=np.bool_)
-    noise, z = np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2, problem.z
+    noise, z = (
+        np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2,
+        problem.z,
+    )
     for left in reversed(range(fits)):
         root, z = np.linalg.inv(np.linalg.cholesky(noise)), problem.recentred(z)
         if left == 1:
@@ -471,7 +569,9 @@ def _posterior(problem: _Problem, z: FloatArray, jacobian: FloatArray) -> Identi
     """Return the robot at z with its uncertainty, given the Jacobian of the residuals, (k m, p)."""
     errors, s, unit = problem.errors(z), problem.scale, np.eye(len(z))
     noise, inliers = robust_covariance(errors)
-    correlation = correlation_time((errors @ np.linalg.inv(np.linalg.cholesky(noise)).T) * inliers[:, None])
+    correlation = correlation_time(
+        (errors @ np.linalg.inv(np.linalg.cholesky(noise)).T) * inliers[:, None]
+    )
     information = jacobian.T @ jacobian / correlation
     covariance = np.linalg.inv(information + unit)
     wider = np.linalg.inv(information + unit / 4.0)

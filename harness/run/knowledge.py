@@ -20,7 +20,9 @@ from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 FILE = "networks.npz"
-NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes ten times longer to read
+NETWORKS_KEPT = (
+    8  # trained networks in the memory of a process; a file takes ten times longer to read
+)
 _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
 
 
@@ -32,13 +34,17 @@ def nominal_knowledge(
     The Jacobian of the latter covers postures with the target in view only.
     """
     if not robot.known:
-        knowledge = RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
+        knowledge = RobotKnowledge(
+            spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper)
+        )
         return knowledge, knowledge
     region = robot.workspace.lower, robot.workspace.upper
     knowledge = RobotKnowledge(spec, run.preview_rows, nominal.jacobian, region=region)
     if nominal is robot.nominal:
         return knowledge, knowledge
-    return knowledge, replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
+    return knowledge, replace(
+        knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home)
+    )
 
 
 @final
@@ -55,7 +61,9 @@ class NetworkSource:
         """Return the networks of a configuration."""
 
         def make(folder: Path) -> None:
-            save_networks(train(config, self.nominal_jacobian, self.spec, self.progress), folder / FILE)
+            save_networks(
+                train(config, self.nominal_jacobian, self.spec, self.progress), folder / FILE
+            )
 
         with one_thread():
             digest = training_digest(config, self.nominal_jacobian, self.spec)

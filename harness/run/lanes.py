@@ -60,7 +60,11 @@ class Ends:
 
     def left_of(self, lanes: LaneIndex) -> LaneIndex | None:
         """Return the places of the runs that are still under way among those that were, or None if all are."""
-        return None if len(lanes) == len(self.running) else np.flatnonzero(np.isin(lanes, self.running))
+        return (
+            None
+            if len(lanes) == len(self.running)
+            else np.flatnonzero(np.isin(lanes, self.running))
+        )
 
     def spread(self, tree: Tree, before: Tree) -> Tree:
         """Return arrays of the runs under way in their places among all runs; the others keep those from before."""
@@ -184,12 +188,18 @@ def failing_lanes(
         return []
     if len(lanes) == 1:
         lane = int(lanes[0])
-        return [(lane, _error_of_step(servo, state, given, lane) or error)]  # with the words of a single run
+        # With the words of a single run
+        return [(lane, _error_of_step(servo, state, given, lane) or error)]
     half = len(lanes) // 2
-    return [*failing_lanes(servo, state, given, lanes[:half]), *failing_lanes(servo, state, given, lanes[half:])]
+    return [
+        *failing_lanes(servo, state, given, lanes[:half]),
+        *failing_lanes(servo, state, given, lanes[half:]),
+    ]
 
 
-def _error_of_step(servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: Lanes) -> Exception | None:
+def _error_of_step(
+    servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: Lanes
+) -> Exception | None:
     try:
         servo.step(take(state, lanes), *take(given, lanes))
     except Exception as error:  # noqa: BLE001 - a part may raise anything
@@ -221,9 +231,13 @@ class ManyLogs(StepLog):
 def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     """Return the key that runs of one campaign must share to advance together; None for a run that goes alone."""
     request = run.request
-    if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
+    if not (
+        find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side
+    ):
         return None
-    if ".py" in request.sensing:  # the bits of a user's measure may be others for many robots than for one
+    if (
+        ".py" in request.sensing
+    ):  # the bits of a user's measure may be others for many robots than for one
         return None
     moved = request.mismatch.size("camera_move") > 0.0
     names = request.plant, request.controller, request.task, moved, request.robot, request.sensing

@@ -46,11 +46,15 @@ class Steps:
     joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
     command: FloatArray  # (k, ..., n) [rad/s]
     feature_valid: npt.NDArray[np.bool_]  # (k, ...), whether a measurement arrived
-    estimated_jacobian: FloatArray  # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
+    estimated_jacobian: (
+        FloatArray  # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
+    )
     true_jacobian: FloatArray  # (k, ..., m, n) [unit of the feature per rad]
     controller_time: FloatArray  # (k,) [µs]
     plant_time: FloatArray  # (k,) [µs]
-    diagnostics: dict[str, FloatArray]  # (k,) for each number that the controller gave at least once; of one run only
+    diagnostics: dict[
+        str, FloatArray
+    ]  # (k,) for each number that the controller gave at least once; of one run only
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -60,8 +64,14 @@ class Steps:
         """Return the first rows, of all runs or of one of those side by side."""
         arrays = {item.name: getattr(self, item.name)[:rows] for item in fields(self)[1:-1]}
         if lane is not None:
-            arrays = {name: array if array.ndim == 1 else array[:, lane] for name, array in arrays.items()}
-        return Steps(self.spec, **arrays, diagnostics={name: all_[:rows] for name, all_ in self.diagnostics.items()})
+            arrays = {
+                name: array if array.ndim == 1 else array[:, lane] for name, array in arrays.items()
+            }
+        return Steps(
+            self.spec,
+            **arrays,
+            diagnostics={name: all_[:rows] for name, all_ in self.diagnostics.items()},
+        )
 
     def error_norm(self) -> FloatArray:
         """Return ‖reference − true feature‖, (k, ...) [unit of the feature]."""
@@ -87,7 +97,11 @@ class Steps:
             run_id: content of the first column.
             full_jacobian: add every entry of the estimated and of the true Jacobian.
         """
-        columns: dict[str, object] = {"run_id": run_id, "step": np.arange(len(self)), "time_s": self.time}
+        columns: dict[str, object] = {
+            "run_id": run_id,
+            "step": np.arange(len(self)),
+            "time_s": self.time,
+        }
         logged = self.reference, self.feature, self.true_feature, self.joint_position, self.command
         for names, values in zip(column_names(self.spec).values(), logged, strict=True):
             columns.update(zip(names, values.T, strict=True))
@@ -95,7 +109,10 @@ class Steps:
         columns["jacobian_error"] = self.jacobian_error()
         columns["jacobian_condition"] = self.jacobian_condition()
         columns["feature_valid"] = self.feature_valid
-        columns["controller_time_us"], columns["plant_time_us"] = self.controller_time, self.plant_time
+        columns["controller_time_us"], columns["plant_time_us"] = (
+            self.controller_time,
+            self.plant_time,
+        )
         columns.update((f"diagnostic_{name}", values) for name, values in self.diagnostics.items())
         if full_jacobian:
             columns.update(self._entries("estimated_jacobian", self.estimated_jacobian))

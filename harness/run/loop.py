@@ -45,7 +45,9 @@ class LoopSettings:
 
     periods: int  # control periods in the run
     preview: int = 0  # future rows of the reference that a controller gets
-    lost_after_periods: int = sys.maxsize  # a run ends after so many periods in a row without a valid feature
+    lost_after_periods: int = (
+        sys.maxsize
+    )  # a run ends after so many periods in a row without a valid feature
     camera_move: CameraMove | None = None  # a move of the camera in the middle of the run, or None
 
 
@@ -93,7 +95,9 @@ class Rollout:
     def loss(self) -> FeatureLost:
         """Return the fault of runs that had no valid feature for too long."""
         periods = self.settings.lost_after_periods
-        return FeatureLost(f"no valid feature for {periods} periods, until {self.observation.time:g} s")
+        return FeatureLost(
+            f"no valid feature for {periods} periods, until {self.observation.time:g} s"
+        )
 
 
 def periods(rollout: Rollout, controller: Controller) -> Iterator[Period]:
@@ -111,11 +115,18 @@ def periods(rollout: Rollout, controller: Controller) -> Iterator[Period]:
         truth = rollout.plant.truth()
         released = perf_counter_ns()
         rollout.advance(command)
-        yield Period(observation, reference, command, truth, (decided - began, perf_counter_ns() - released))
+        yield Period(
+            observation, reference, command, truth, (decided - began, perf_counter_ns() - released)
+        )
 
 
 def run_loop(
-    plant: Plant, controller: Controller, desired: FloatArray, settings: LoopSettings, seed: Seeds, log: StepLog
+    plant: Plant,
+    controller: Controller,
+    desired: FloatArray,
+    settings: LoopSettings,
+    seed: Seeds,
+    log: StepLog,
 ) -> None:
     """Step `plant` and `controller` against a reference and write one row a period into `log`.
 
@@ -130,7 +141,9 @@ def run_loop(
     Raises:
         RunFault: the run ended before its last period; the rows so far are in the log.
     """
-    rollout = begin(plant, controller, desired, settings, (_named(seed, "plant"), _named(seed, "controller")))
+    rollout = begin(
+        plant, controller, desired, settings, (_named(seed, "plant"), _named(seed, "controller"))
+    )
     for period in periods(rollout, controller):
         log.add(period, controller.estimated_jacobian(), controller.diagnostics())
         lost = rollout.lost()
@@ -139,7 +152,11 @@ def run_loop(
 
 
 def begin(
-    plant: Plant, controller: Controller, desired: FloatArray, settings: LoopSettings, seeds: tuple[Any, Any]
+    plant: Plant,
+    controller: Controller,
+    desired: FloatArray,
+    settings: LoopSettings,
+    seeds: tuple[Any, Any],
 ) -> Rollout:
     """Reset plant and controller, each with its own of `seeds`, and return the run at its first instant."""
     rollout = Rollout(plant, plant.reset(seeds[0]), desired, settings)
@@ -148,7 +165,11 @@ def begin(
 
 
 def _named(seed: Seeds, name: str) -> Any:  # noqa: ANN401 - as `seed`
-    return named_seed(seed, name) if isinstance(seed, int) else [named_seed(each, name) for each in seed]
+    return (
+        named_seed(seed, name)
+        if isinstance(seed, int)
+        else [named_seed(each, name) for each in seed]
+    )
 
 
 @contextmanager

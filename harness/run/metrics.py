@@ -49,11 +49,17 @@ class Judged:
         """Arrange the rows; see `judge_run`."""
         self.steps, self.fixed, self.period = steps, kind == "point_to_point", steps.spec.period
         self.error = _columns(steps.error_norm())
-        self.feature, self.reference, self.command = map(_columns, (steps.true_feature, steps.reference, steps.command))
+        self.feature, self.reference, self.command = map(
+            _columns, (steps.true_feature, steps.reference, steps.command)
+        )
         begins = np.array([evaluate_from, lap_time, 2.0 * lap_time])
         judged_from, second, third = np.searchsorted(steps.time, begins - 1e-9)
-        self.evaluated, self.second_lap = self.error[..., judged_from:], self.error[..., second:third]
-        self.acceleration = np.diff(self.command, axis=-1) / self.period  # without the step from rest
+        self.evaluated, self.second_lap = (
+            self.error[..., judged_from:],
+            self.error[..., second:third],
+        )
+        # Without the step from rest
+        self.acceleration = np.diff(self.command, axis=-1) / self.period
         self.jerk = np.diff(self.acceleration, axis=-1) / self.period
 
     def same(self, value: float) -> FloatArray:
@@ -87,7 +93,9 @@ class Metric:
     summary: Summary | None = None  # its column in the table that a command prints at its end
 
 
-def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan) -> dict[str, FloatArray]:
+def judge_run(
+    steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan
+) -> dict[str, FloatArray]:
     """Return the metrics of a run, or of runs side by side.
 
     Args:
@@ -100,7 +108,9 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
         Metric name -> (...); NaN where a metric does not apply, as the times of runs side by side.
     """
     run = Judged(steps, kind, evaluate_from, lap_time)
-    return {name: metric.values(run) for name, metric in METRICS.items() if metric.values is not None}
+    return {
+        name: metric.values(run) for name, metric in METRICS.items() if metric.values is not None
+    }
 
 
 def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> FloatArray:
@@ -119,8 +129,12 @@ def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> Floa
     first = np.where(outside.any(axis=-1), count - outside[..., ::-1].argmax(axis=-1), 0)
     settled = (count - first) * period >= DWELL - 1e-9
     row = np.where(settled, first, 0)[..., None]
-    before, after = (np.take_along_axis(error, rows, axis=-1)[..., 0] for rows in (np.maximum(row - 1, 0), row))
-    with np.errstate(divide="ignore", invalid="ignore"):  # where the first row is inside, or no row stays inside
+    before, after = (
+        np.take_along_axis(error, rows, axis=-1)[..., 0] for rows in (np.maximum(row - 1, 0), row)
+    )
+    with np.errstate(
+        divide="ignore", invalid="ignore"
+    ):  # where the first row is inside, or no row stays inside
         crossing = first - np.where(first > 0, (band - after) / (before - after), 0.0)
     return np.where(settled, crossing * period, np.nan)
 
@@ -181,7 +195,11 @@ def final_rows(period: float) -> slice:
 
 
 def _path_length_ratio(run: Judged) -> FloatArray:
-    way = norm(run.reference[..., 0] - run.feature[..., 0]) if run.fixed else path_length(run.reference)
+    way = (
+        norm(run.reference[..., 0] - run.feature[..., 0])
+        if run.fixed
+        else path_length(run.reference)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(way > 0.0, path_length(run.feature) / way, np.nan)
 
@@ -194,7 +212,9 @@ def _saturation(run: Judged) -> FloatArray:
 def _overruns(run: Judged) -> FloatArray:
     """Return the number of steps of the controller that took longer than the period; NaN where times are unknown."""
     times = run.steps.controller_time
-    return run.same(math.nan if np.isnan(times).any() else float(np.count_nonzero(times > 1e6 * run.period)))
+    return run.same(
+        math.nan if np.isnan(times).any() else float(np.count_nonzero(times > 1e6 * run.period))
+    )
 
 
 def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -208,7 +228,9 @@ def _peak(run: Judged, values: FloatArray) -> FloatArray:
 
 def _rms(run: Judged, values: FloatArray) -> FloatArray:
     """Return the root mean square over the last axis; NaN where it is empty."""
-    return np.asarray(np.sqrt(np.mean(values**2, axis=-1))) if values.shape[-1] else run.same(np.nan)
+    return (
+        np.asarray(np.sqrt(np.mean(values**2, axis=-1))) if values.shape[-1] else run.same(np.nan)
+    )
 
 
 def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatArray:
@@ -216,7 +238,9 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
     if not np.isnan(values).any():
         return np.asarray(summary(values, axis=-1))
     rows = [row[~np.isnan(row)] for row in values.reshape(-1, values.shape[-1])]
-    return np.array([summary(row) if len(row) else np.nan for row in rows]).reshape(values.shape[:-1])
+    return np.array([summary(row) if len(row) else np.nan for row in rows]).reshape(
+        values.shape[:-1]
+    )
 
 
 _ALL: Final = (

@@ -33,7 +33,8 @@ SETTLED, NOT_SETTLED = "settled", "not_settled"
 FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"
 TARGET_UNREACHABLE, JOINT_AT_LIMIT = "target_unreachable", "joint_at_limit"
 ACHIEVED: Final = (SETTLED, FOLLOWED)
-OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)  # without the faults
+# Without the faults
+OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)
 FOLLOWING_BANDS: Final = 2.0  # settling bands: an RMS error of 10 mm on the UR5
 AT_STOP: Final = 1e-6  # [rad] from a joint's stop
 HELD: Final = 1.0  # [s] at a stop
@@ -41,7 +42,11 @@ CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
 
 
 def find_outcome(
-    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: RobotModel | None
+    steps: Steps,
+    scenario: Scenario,
+    settling_time: float,
+    rms_error_evaluated: float,
+    robot: RobotModel | None,
 ) -> str:
     """Return the outcome of a run that completed.
 
@@ -57,7 +62,9 @@ def find_outcome(
     band = (1.0 if move else FOLLOWING_BANDS) * steps.spec.feature.band
     if not math.isnan(settling_time) if move else rms_error_evaluated <= band:
         return SETTLED if move else FOLLOWED
-    if isinstance(robot, HandEyeModel) and _is_out_of_reach(steps, robot, scenario.evaluate_from, band):
+    if isinstance(robot, HandEyeModel) and _is_out_of_reach(
+        steps, robot, scenario.evaluate_from, band
+    ):
         return TARGET_UNREACHABLE
     if joint_rests_at_limit(steps, band):
         return JOINT_AT_LIMIT
@@ -78,15 +85,26 @@ def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, ba
     judged = steps.reference[np.searchsorted(steps.time, evaluate_from - 1e-9) :]
     points: FloatArray = np.unique(judged[:: max(1, len(judged) // CURVE_POINTS)], axis=0)
     spec = steps.spec
-    return bool((closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper) > band).any())
+    return bool(
+        (
+            closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper)
+            > band
+        ).any()
+    )
 
 
-def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> dict[str, FloatArray]:
+def pose_errors(
+    robot: RobotModel | None, reference: Reference, steps: Steps
+) -> dict[str, FloatArray]:
     """Return distance and angle of the target from its reference pose, (k,), as columns; none where not judged.
 
     Where the camera is moved during the run, the target is still judged by its taught pose.
     """
-    if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, ImageReference)):
+    if not (
+        isinstance(robot, SetupModel)
+        and robot.setup.judges_pose
+        and isinstance(reference, ImageReference)
+    ):
         return {}
     distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
     return {"pose_error_mm": 1e3 * distance, "pose_error_deg": np.degrees(angle)}

@@ -12,15 +12,29 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from servobench.harness.run.identification import MIN_FRAMES, OUTLIER, Identified, Log, fit_cameras, frames_of, identify
+from servobench.harness.run.identification import (
+    MIN_FRAMES,
+    OUTLIER,
+    Identified,
+    Log,
+    fit_cameras,
+    frames_of,
+    identify,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
 MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the nominal robot
 UNITS: Final = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
-UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
-REFUSED_SHARE: Final = 0.1  # [1] of the motion of features, from which errors that nothing explains are refused
-MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
+UNEXPLAINED: Final = (
+    1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
+)
+REFUSED_SHARE: Final = (
+    0.1  # [1] of the motion of features, from which errors that nothing explains are refused
+)
+MIN_SHARE: Final = (
+    0.01  # [1] of the motion of features, below which residuals are small in any case
+)
 GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
 PAIR_GAIN: Final = 0.5  # [1] of the residual of one mistake, below which two explain it
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
@@ -63,10 +77,16 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         robot = other if _is_noise(log, other) else robot
     found = _clocks(log, robot)
     if not is_explained(log, robot):
-        known = dict(zip(robot.names, robot.values.tolist(), strict=True)) if _is_noise(log, robot) else {}
+        known = (
+            dict(zip(robot.names, robot.values.tolist(), strict=True))
+            if _is_noise(log, robot)
+            else {}
+        )
         found = _undone(log, model, others, known) or found
         if not found and (large := _large_errors(log, robot)):
-            found = next(filter(None, (_undone(half, model, others, {}) for half, _ in _halves(log))), large)
+            found = next(
+                filter(None, (_undone(half, model, others, {}) for half, _ in _halves(log))), large
+            )
     return found, None if found else robot
 
 
@@ -93,7 +113,9 @@ def _is_noise(log: Log, robot: Identified) -> bool:
 
 def _shares(log: Log, robot: Identified) -> FloatArray:
     """Return the errors of a feature over its motion, (m,)."""
-    return np.asarray(np.sqrt(np.diag(robot.noise)) / np.std(log.features[robot.rows], axis=0).max())
+    return np.asarray(
+        np.sqrt(np.diag(robot.noise)) / np.std(log.features[robot.rows], axis=0).max()
+    )
 
 
 def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
@@ -113,16 +135,23 @@ def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
             zeros[left[less]], errors[left[less]] = tried[less, best[less]], found[less, best[less]]
         left = left[errors[left] < before]
     zero = (zeros[errors.argmin()] + math.pi) % (2.0 * math.pi) - math.pi
-    return {f"zero_{name}": each for name, each in zip(log.spec.joint_names, zero.tolist(), strict=True)}
+    return {
+        f"zero_{name}": each for name, each in zip(log.spec.joint_names, zero.tolist(), strict=True)
+    }
 
 
 def _units(log: Log, model: RobotModel) -> str:
     """Name features that are likely in a smaller unit than m."""
     rows = frames_of(log)
-    made, moved = (np.linalg.norm(_spread(each)) for each in (model.feature(log.joints[rows]), log.features[rows]))
+    made, moved = (
+        np.linalg.norm(_spread(each))
+        for each in (model.feature(log.joints[rows]), log.features[rows])
+    )
     if log.spec.feature.unit == "m" and moved > MAX_RATIO * made:
         found = f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m"
-        unit = min(UNITS, key=lambda unit: abs(math.log(moved / max(float(made), 1e-9) * UNITS[unit])))
+        unit = min(
+            UNITS, key=lambda unit: abs(math.log(moved / max(float(made), 1e-9) * UNITS[unit]))
+        )
         return f"{found}: they are likely in {unit}; write them in m"
     return ""
 
@@ -150,7 +179,9 @@ def _clocks(log: Log, robot: Identified) -> str:
     time, rates = log.time[robot.rows], robot.rates(log) * robot.inliers[:, None]
     shifts, speeds = np.sum(rates * robot.residuals, axis=1), np.sum(rates**2, axis=1)
     weights = time - np.average(time, weights=speeds)  # of the lateness of each frame in the drift
-    scatter = math.sqrt(robot.correlation * np.sum((weights * shifts) ** 2)) / float(np.sum(weights**2 * speeds))
+    scatter = math.sqrt(robot.correlation * np.sum((weights * shifts) ** 2)) / float(
+        np.sum(weights**2 * speeds)
+    )
     deviation = max(deviation, scatter)  # larger where fast frames are late by changing times
     total = 1e3 * float(np.ptp(log.time))  # [ms]
     if abs(drift) < max(CERTAIN * deviation, DRIFT / total):
@@ -176,7 +207,9 @@ def _moved(log: Log, model: RobotModel) -> str:
             if abs(shift) > 0.5 * log.spec.period:
                 frames = f"frames come {1e3 * shift:+.0f} ms later from there on, as where one is lost or doubled"
                 return f"{jump}: {frames}; cut the log there, or shift them"
-            return f"{jump}: the camera or the ball was moved, or a frame is lost; cut the log there"
+            return (
+                f"{jump}: the camera or the ball was moved, or a frame is lost; cut the log there"
+            )
     return ""
 
 
@@ -272,7 +305,9 @@ def _remedies(log: Log, model: RobotModel, others: Others) -> Iterator[_Remedy]:
             offset = np.where(np.arange(n) == i, math.radians(turn), 0.0)
             yield changed(f"the zero of joint {name} is {turn}° off", joints=q + offset)
     if log.spec.feature.unit == "m":
-        yield changed("an axis of the camera is mirrored, or two are exchanged", features=y * (1, 1, -1))
+        yield changed(
+            "an axis of the camera is mirrored, or two are exchanged", features=y * (1, 1, -1)
+        )
     else:
         size = 2.0 * np.median(y, axis=0)
         yield changed("an axis of the image is mirrored", features=(size - y) * (1, 0) + y * (0, 1))

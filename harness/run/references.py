@@ -51,11 +51,15 @@ class Reference(ABC):
         """
         rows = np.array(self.at(np.arange(count) * period), dtype=np.float64)
         if rows.shape[:-1] != (count,):
-            raise ConfigurationError(f"the task's reference needs a row for each of {count} times, got {rows.shape}")
+            raise ConfigurationError(
+                f"the task's reference needs a row for each of {count} times, got {rows.shape}"
+            )
         if not (finite := np.isfinite(rows).all(axis=-1)).all():
             first = int(finite.argmin())
             wanted = "the reference of the task must be finite over the run and beyond it, as far as it is previewed"
-            raise ConfigurationError(f"{wanted}; got {rows[first].tolist()} at {first * period:g} s")
+            raise ConfigurationError(
+                f"{wanted}; got {rows[first].tolist()} at {first * period:g} s"
+            )
         rows.flags.writeable = False
         return rows
 
@@ -80,7 +84,11 @@ class Waypoints(Reference):
 
     def __post_init__(self) -> None:
         """Check sizes and order."""
-        if self.points.ndim != 2 or self.times.shape != (len(self.points),) or len(self.points) == 0:
+        if (
+            self.points.ndim != 2
+            or self.times.shape != (len(self.points),)
+            or len(self.points) == 0
+        ):
             came = f"{self.times.shape}, {self.points.shape}"
             raise ValueError(f"waypoints need times (p,) and points (p, m), got {came}")
         if not (np.diff(self.times) > 0.0).all() or self.times[0] < 0.0:
@@ -138,7 +146,9 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
     names = [f"{name}_{column_unit(feature.unit)}" for name in feature.names]
     values = numbers_of(file, read_table("waypoint file", path), ["time_s", *names])
     if values[0, 0] > MAX_BEGIN:
-        raise ConfigurationError(f"{file} begins at {values[0, 0]:.0f} s; write time_s from the run's begin on")
+        raise ConfigurationError(
+            f"{file} begins at {values[0, 0]:.0f} s; write time_s from the run's begin on"
+        )
     with configuration_errors(f"{file}: "):
         return Waypoints(values[:, 0], values[:, 1:])
 
@@ -183,7 +193,11 @@ class FollowedCurve(ImageReference):
         """Return the place at each time."""
         home = self.model.points(self.robot.workspace.home)
         ratio, pose = self.model.distance / self.robot.workspace.camera_distance, self.model.camera
-        curve = ratio * self.curve.at(time) if self.robot.camera is None else self._in_own_image(ratio, time)
+        curve = (
+            ratio * self.curve.at(time)
+            if self.robot.camera is None
+            else self._in_own_image(ratio, time)
+        )
         place = np.matvec(pose[:3, :3], curve) + pose[:3, 3]
         return np.asarray(place[..., None, :] + (home - home.mean(axis=-2)))
 

@@ -19,7 +19,15 @@ from servobench.harness.config.source import SourceFile, describe_at, find_place
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, native, settings
+from servobench.plant.contract.settings import (
+    NonNegative,
+    Number,
+    Positive,
+    ShareBelowOne,
+    Usual,
+    native,
+    settings,
+)
 from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.mismatch import Mismatch
@@ -47,7 +55,8 @@ SHORT_NAMES: Final[Mapping[str, ShortName]] = {
     "period": ShortName("run.period", "period_s", "period [ms]"),
 }
 ROLES: Final = ("plant", "controller", "task")
-SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))  # with which the key of a varied setting begins
+# With which the key of a varied setting begins
+SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))
 ORDER: Final = {short.key: order for order, short in enumerate(SHORT_NAMES.values())}
 
 Value: TypeAlias = float | int | bool | str | tuple["Value", ...]
@@ -126,7 +135,9 @@ class RunRequest:
                     value = in_own_unit(*parts, "s" if short.unit else "1")
             if isinstance(value, int | float):
                 by_role[short.key] = float(value)
-        return tuple(sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0])))
+        return tuple(
+            sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0]))
+        )
 
     def _by_role(self, key: str) -> str:
         """Return a setting's key with the role of its section in place of a plant's, controller's or task's name."""
@@ -143,7 +154,11 @@ class RunRequest:
 
     def varied_in(self, role: str) -> Varied:
         """Return the varied settings of a section, `run` or one of `ROLES`, by dotted key within it."""
-        return tuple((key.removeprefix(f"{role}."), each) for key, each in self.varied if key.startswith(f"{role}."))
+        return tuple(
+            (key.removeprefix(f"{role}."), each)
+            for key, each in self.varied
+            if key.startswith(f"{role}.")
+        )
 
     def varies(self, key: str) -> bool:
         """Return whether this run varies the setting of a key such as `kinematic.lag`."""
@@ -152,7 +167,11 @@ class RunRequest:
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        robot = "" if self.robot == DEFAULT_ROBOT else f"{short_name(self.robot).replace(catalogue.WITH, '+')}-"
+        robot = (
+            ""
+            if self.robot == DEFAULT_ROBOT
+            else f"{short_name(self.robot).replace(catalogue.WITH, '+')}-"
+        )
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{Path(self.sensing).name}-"
         varied = "".join(map(_in_name, self.varied))
         name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}-{self.seed}"
@@ -167,17 +186,33 @@ class RunRequest:
         short = {each.column: varied.pop(each.key, each.usual) for each in SHORT_NAMES.values()}
         names = {name: getattr(self, name) for name in ("run_id", "plant", "controller", "task")}
         names |= {"mismatch": str(self.mismatch), "seed": self.seed, **short}
-        others = {key: json.dumps(value) if isinstance(value, tuple) else value for key, value in varied.items()}
+        others = {
+            key: json.dumps(value) if isinstance(value, tuple) else value
+            for key, value in varied.items()
+        }
         return {**names, "robot": self.robot, "sensing": self.sensing, **others}
 
 
 def varied_in_row(row: Mapping[str, Any]) -> Varied:
     """Return the settings that a run varies, by key, from its row in a table of runs."""
     usual = {short.column: short.usual for short in SHORT_NAMES.values()}
-    columns = {short.column: short.key for short in SHORT_NAMES.values()} | {key: key for key in row if "." in key}
-    values = {key: row[name] for name, key in columns.items() if row.get(name) not in (None, usual.get(name))}
-    given = {key: json.loads(value) if str(value).startswith("[") else value for key, value in values.items()}
-    return tuple((key, value) for key, value in given.items() if not (isinstance(value, float) and math.isnan(value)))
+    columns = {short.column: short.key for short in SHORT_NAMES.values()} | {
+        key: key for key in row if "." in key
+    }
+    values = {
+        key: row[name]
+        for name, key in columns.items()
+        if row.get(name) not in (None, usual.get(name))
+    }
+    given = {
+        key: json.loads(value) if str(value).startswith("[") else value
+        for key, value in values.items()
+    }
+    return tuple(
+        (key, value)
+        for key, value in given.items()
+        if not (isinstance(value, float) and math.isnan(value))
+    )
 
 
 def varied_columns(columns: Iterable[str]) -> dict[str, tuple[str, float]]:
@@ -211,7 +246,9 @@ def read_mismatch(text: str) -> Mismatch:
         ConfigurationError: it cannot be read.
     """
     if not isinstance(text, str):
-        raise ConfigurationError(f"mismatch must be a text such as 'moderate' or 'links=10%', got {text!r}")
+        raise ConfigurationError(
+            f"mismatch must be a text such as 'moderate' or 'links=10%', got {text!r}"
+        )
     with configuration_errors():
         return Mismatch.parse(text)
 
@@ -222,13 +259,16 @@ def read_seed(seed: Any) -> int:  # noqa: ANN401 - as a user gave it
     Raises:
         ConfigurationError: it is no such number.
     """
-    whole = hasattr(seed, "__index__") and not isinstance(seed, bool) and not getattr(seed, "ndim", 0)
+    whole = (
+        hasattr(seed, "__index__") and not isinstance(seed, bool) and not getattr(seed, "ndim", 0)
+    )
     if not whole or operator.index(seed) < 0:
         raise ConfigurationError(f"seed must be a non-negative integer, got {native(seed)!r}")
     return operator.index(seed)
 
 
-find_robot = configuration_errors()(catalogue.find_robot)  # a ConfigurationError for a name that cannot be used
+# A ConfigurationError for a name that cannot be used
+find_robot = configuration_errors()(catalogue.find_robot)
 
 
 def with_camera(robot: str, camera: Path) -> str:
@@ -242,7 +282,9 @@ def with_camera(robot: str, camera: Path) -> str:
         if catalogue.read_word(word).camera == str(path):
             find_robot(word)
             return word
-    raise ConfigurationError(f"{word!r} is also the name of a file; give robot or camera another name")
+    raise ConfigurationError(
+        f"{word!r} is also the name of a file; give robot or camera another name"
+    )
 
 
 def short_name(robot: str) -> str:
@@ -295,7 +337,9 @@ def sensing_place(word: str) -> str:
 
 def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
     """Return the set-up called `name` that a file defines, or without a name its only one."""
-    setups = {key: value for key, value in vars(source.load()).items() if isinstance(value, SensingSetup)}
+    setups = {
+        key: value for key, value in vars(source.load()).items() if isinstance(value, SensingSetup)
+    }
     found = {key: value for key, value in setups.items() if value not in SETUPS.values()}
     if not found:
         wanted = "no object of servobench.plant.cameras.setups.SensingSetup"
@@ -304,4 +348,6 @@ def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
     if name in found or (name is None and not others):
         return found[name or first]
     wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
-    raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")
+    raise ConfigurationError(
+        f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}"
+    )

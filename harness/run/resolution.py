@@ -8,7 +8,14 @@ import numpy as np
 
 from servobench.harness.config import registry
 from servobench.harness.config.settings import Settings, default_config, flatten, nest
-from servobench.harness.run.request import DEFAULT_ROBOT, ROLES, RunRequest, RunSettings, Varied, find_robot
+from servobench.harness.run.request import (
+    DEFAULT_ROBOT,
+    ROLES,
+    RunRequest,
+    RunSettings,
+    Varied,
+    find_robot,
+)
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
@@ -27,14 +34,22 @@ class Sections(dict[str, Any]):
         given: their dotted keys by section, but for defaults that a file repeats.
     """
 
-    def __init__(self, sections: Mapping[str, Any], user: Settings, defaults: Mapping[str, Any]) -> None:
+    def __init__(
+        self, sections: Mapping[str, Any], user: Settings, defaults: Mapping[str, Any]
+    ) -> None:
         """Keep settings by section."""
         super().__init__(sections)
         self.user, self.given = user, dict[str, frozenset[str]]()
         for name in sections.keys() & user.sections.keys() & defaults.keys():
             usual, own = flatten(defaults[name]), flatten(sections[name])
-            repeated = {key for key in own if (name, key) in user.filed and np.array_equal(own[key], usual[key])}
-            self.given[name] = frozenset(flatten(user.sections[name]).keys() & own.keys() - repeated)
+            repeated = {
+                key
+                for key in own
+                if (name, key) in user.filed and np.array_equal(own[key], usual[key])
+            }
+            self.given[name] = frozenset(
+                flatten(user.sections[name]).keys() & own.keys() - repeated
+            )
         self._frames: dict[tuple[str, float], Varied] = {}
         self._changed: dict[tuple[str, Varied], Any] = {}
 
@@ -48,7 +63,9 @@ class Sections(dict[str, Any]):
             return self[section]
         if (section, changes) not in self._changed:
             with configuration_errors():
-                self._changed[section, changes] = override(section, self[section], nest(dict(changes)))
+                self._changed[section, changes] = override(
+                    section, self[section], nest(dict(changes))
+                )
         return self._changed[section, changes]
 
     def frames(self, plant: str, robot: Robot, period: float) -> Varied:
@@ -56,9 +73,15 @@ class Sections(dict[str, Any]):
         if period == self["run"].period or (robot.camera is None and robot.twin is None):
             return ()
         if (plant, period) not in self._frames:
-            config = self.user.resolve(plant, _plant_default(registry.find_plant(plant), robot, period))
+            config = self.user.resolve(
+                plant, _plant_default(registry.find_plant(plant), robot, period)
+            )
             usual, own = flatten(self[plant]), flatten(config)
-            changes = ((key, own[key]) for key in own if key.startswith("sensing.") and own[key] != usual[key])
+            changes = (
+                (key, own[key])
+                for key in own
+                if key.startswith("sensing.") and own[key] != usual[key]
+            )
             self._frames[plant, period] = tuple(changes)
         return self._frames[plant, period]
 
@@ -83,7 +106,9 @@ def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
     return select(request, resolve_sections([request], settings))
 
 
-def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_run: bool = True) -> Sections:
+def resolve_sections(
+    requests: Iterable[RunRequest], settings: Settings, *, to_run: bool = True
+) -> Sections:
     """Return the typed settings of every section that `requests` read, by name.
 
     Args:
@@ -98,35 +123,56 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     for request in requests:
         for name, what in ((request.plant, "plant"), (request.controller, "controller")):
             if name in task_names():
-                raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
+                raise ConfigurationError(
+                    f"a task is called {name!r}, too; give the {what} another name"
+                )
         if request.plant == request.controller:
-            raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
+            raise ConfigurationError(
+                f"plant and controller are both called {request.plant!r}; give one another name"
+            )
     robots = list(dict.fromkeys(each.robot for each in requests)) or [DEFAULT_ROBOT]
     if len(robots) > 1:  # of which they share the settings of plants and tasks
-        raise ConfigurationError(f"a batch has one robot, got {', '.join(robots)}; use a batch for each")
+        raise ConfigurationError(
+            f"a batch has one robot, got {', '.join(robots)}; use a batch for each"
+        )
     robot, period = find_robot(robots[0]), settings.resolve("run", RunSettings()).period
     find = registry.installed_plant if to_run else registry.find_plant
-    plants, controllers, tasks = (dict.fromkeys(getattr(each, role) for each in requests) for role in ROLES)
+    plants, controllers, tasks = (
+        dict.fromkeys(getattr(each, role) for each in requests) for role in ROLES
+    )
     defaults: dict[str, Any] = {"run": RunSettings()}
     defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
-    defaults |= {name: default_config(registry.find_controller(name), model_known=robot.known) for name in controllers}
+    defaults |= {
+        name: default_config(registry.find_controller(name), model_known=robot.known)
+        for name in controllers
+    }
     if all(find(name).no_model for name in plants):
         _probe(defaults, list(plants), [name for name in controllers if _may_probe(name, settings)])
     defaults |= {name: fitted(name, robot) for name in tasks}
-    return Sections({name: settings.resolve(name, default) for name, default in defaults.items()}, settings, defaults)
+    return Sections(
+        {name: settings.resolve(name, default) for name, default in defaults.items()},
+        settings,
+        defaults,
+    )
 
 
 def _may_probe(controller: str, settings: Settings) -> bool:
     """Return whether a controller finds its first Jacobian itself, and the user has not said how."""
     entry = registry.find_controller(controller)
     given = flatten(settings.sections.get(controller, {}))
-    return hasattr(entry.config(), "initial") and not entry.needs_truth and "initial.source" not in given
+    return (
+        hasattr(entry.config(), "initial")
+        and not entry.needs_truth
+        and "initial.source" not in given
+    )
 
 
 def _probe(defaults: dict[str, Any], plants: list[str], controllers: list[str]) -> None:
     """Let controllers find their first Jacobian by moves, without the posture aid, which takes a better one."""
     for name in controllers:
-        defaults[name] = override(name, defaults[name], {"initial": {"source": "probe"}, "aids": {"posture": False}})
+        defaults[name] = override(
+            name, defaults[name], {"initial": {"source": "probe"}, "aids": {"posture": False}}
+        )
     if controllers:
         how = f"{listed(controllers)}: initial.source=probe and aids.posture=false"
         remark(f"{listed(plants)} has no model, so the mismatch is none, and for {how}")
@@ -135,13 +181,25 @@ def _probe(defaults: dict[str, Any], plants: list[str], controllers: list[str]) 
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass
     name, camera = entry.name, robot.camera
     if entry.own_robot and robot.name != DEFAULT_ROBOT:
-        raise ConfigurationError(f"plant {name} brings a robot of its own, so the robot {robot.name} does not apply")
+        raise ConfigurationError(
+            f"plant {name} brings a robot of its own, so the robot {robot.name} does not apply"
+        )
     if camera is not None and (entry.own_robot or not entry.any_sensing):
-        raise ConfigurationError(f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply")
+        raise ConfigurationError(
+            f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply"
+        )
     config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)
     with configuration_errors():
-        config = config if camera is None else replace(config, sensing=camera.sensing(config.sensing, period))
-        return config if robot.twin is None else override(name, config, robot.twin.plant_settings(config, period))
+        config = (
+            config
+            if camera is None
+            else replace(config, sensing=camera.sensing(config.sensing, period))
+        )
+        return (
+            config
+            if robot.twin is None
+            else override(name, config, robot.twin.plant_settings(config, period))
+        )
 
 
 def select(request: RunRequest, sections: Sections) -> ResolvedRun:
@@ -155,20 +213,32 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     mechanical = [key for key in of_sensor if key.startswith("mechanics.")]
     if mechanical and "mechanics" not in {field.name for field in fields(sections[request.plant])}:
         known = "gears and tools are those of kinematic and fmu"
-        raise ConfigurationError(f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}")
+        raise ConfigurationError(
+            f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}"
+        )
     plant, of_profile = request.varied_in("plant"), _of_profile(request, sections)
     run, robot = sections.with_changes("run", request.varied_in("run")), find_robot(request.robot)
     frames = sections.frames(request.plant, robot, run.period)
-    drawn = () if robot.twin is None else _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
+    drawn = (
+        ()
+        if robot.twin is None
+        else _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
+    )
     if both := [key for key, _ in plant if key in of_sensor]:
-        raise ConfigurationError(f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too")
+        raise ConfigurationError(
+            f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too"
+        )
     if both := sorted(of_sensor.keys() & sections.given.get(request.plant, frozenset())):
         word = f"{request.plant}.{both[0]} is set"
-        raise ConfigurationError(f"{word}, and the mismatch {request.mismatch} sets it, too; leave one out")
+        raise ConfigurationError(
+            f"{word}, and the mismatch {request.mismatch} sets it, too; leave one out"
+        )
     return ResolvedRun(
         request,
         run,
-        sections.with_changes(request.plant, (*frames, *drawn, *of_profile.items(), *of_sensor.items(), *plant)),
+        sections.with_changes(
+            request.plant, (*frames, *drawn, *of_profile.items(), *of_sensor.items(), *plant)
+        ),
         sections.with_changes(request.controller, request.varied_in("controller")),
         sections.with_changes(request.task, request.varied_in("task")),
     )
@@ -177,7 +247,9 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
 def _drawn_times(twin: Twin, usual: Mapping[str, Any], seed: int) -> Varied:
     """Return the times of a twin's run that differ from those of its mean, but for times that a user has set."""
     mean = twin.times(0)
-    return tuple((key, time) for key, time in twin.times(seed).items() if usual.get(key) == mean[key] != time)
+    return tuple(
+        (key, time) for key, time in twin.times(seed).items() if usual.get(key) == mean[key] != time
+    )
 
 
 def _of_profile(request: RunRequest, sections: Sections) -> dict[str, float]:
@@ -189,7 +261,10 @@ def _of_profile(request: RunRequest, sections: Sections) -> dict[str, float]:
     profile = PROFILE_SETTINGS.get(request.mismatch.profile, {})
     if not profile:
         return {}
-    own, given = {field.name for field in fields(sections[request.plant])}, sections.given.get(request.plant, ())
+    own, given = (
+        {field.name for field in fields(sections[request.plant])},
+        sections.given.get(request.plant, ()),
+    )
     return {
         key: value
         for key, value in profile.items()
@@ -210,7 +285,11 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
             in a section of a file that does not run.
     """
     names = ["run", *dict.fromkeys(running)]
-    pairs = [section for section in settings.sections if "+" in section and not registry.is_foreign_controller(section)]
+    pairs = [
+        section
+        for section in settings.sections
+        if "+" in section and not registry.is_foreign_controller(section)
+    ]
     known = {*registry.plant_names(), *registry.controller_names(), *task_names(), *pairs, *names}
     for section in settings.sections:
         if section not in known:
@@ -238,5 +317,7 @@ def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
         if section in registry.plant_names():
             return registry.find_plant(section).config()
         return default_config(registry.find_controller(section))
-    except ConfigurationError:  # a plug-in, or a library that is not installed: nothing of this section runs here
+    except (
+        ConfigurationError
+    ):  # a plug-in, or a library that is not installed: nothing of this section runs here
         return None

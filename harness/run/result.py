@@ -94,7 +94,12 @@ class RunResult:
     @classmethod
     def failed(cls, identity: Mapping[str, Any], ending: Ending) -> RunResult:
         """Return the result of a run of which only the columns of its request and its ending are known."""
-        known = {"status": ending.status, "outcome": ending.status, "periods": 0, "reason": ending.reason}
+        known = {
+            "status": ending.status,
+            "outcome": ending.status,
+            "periods": 0,
+            "reason": ending.reason,
+        }
         return cls({**identity, **known, "mismatch_values": "{}"}, None, trace=ending.trace)
 
 
@@ -142,13 +147,23 @@ def _place(error: BaseException) -> _Place | None:
     frames = list(traceback.walk_tb(error.__traceback__))
     own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
     if not own and not isinstance(error, RunFault):
-        ours = [each for each in frames if Path(each[0].f_code.co_filename).is_relative_to(PACKAGE_FOLDER)]
-        own = [each for each in ours if each[0].f_globals.get("__name__") != ConfigurationError.__module__]
+        ours = [
+            each
+            for each in frames
+            if Path(each[0].f_code.co_filename).is_relative_to(PACKAGE_FOLDER)
+        ]
+        own = [
+            each
+            for each in ours
+            if each[0].f_globals.get("__name__") != ConfigurationError.__module__
+        ]
     if not own:
         return None
     frame, line = own[-1]
     function = frame.f_code.co_qualname
-    return _Place(frame.f_code.co_filename, line, frame.f_code.co_name if "<locals>" in function else function)
+    return _Place(
+        frame.f_code.co_filename, line, frame.f_code.co_name if "<locals>" in function else function
+    )
 
 
 def _beginning(method: Callable[..., Any]) -> _Place | None:
@@ -167,7 +182,9 @@ def _trace(error: BaseException) -> str:
     seen = set()
     while shown is not None and id(shown) not in seen:
         seen.add(id(shown))
-        inner = next((i for i, frame in enumerate(shown.stack) if not frame.filename.startswith(HARNESS)), 0)
+        inner = next(
+            (i for i, frame in enumerate(shown.stack) if not frame.filename.startswith(HARNESS)), 0
+        )
         shown.stack = traceback.StackSummary.from_list(shown.stack[inner:][-TRACE_FRAMES:])
         shown = shown.__cause__ or shown.__context__  # type: ignore[assignment]
     return "".join(whole.format())

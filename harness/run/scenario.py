@@ -11,7 +11,13 @@ from typing import ClassVar, Self, TypeAlias, get_args
 
 import numpy as np
 
-from servobench.harness.run.references import FixedPoint, FollowedCurve, Reference, TaskKind, TaughtImage
+from servobench.harness.run.references import (
+    FixedPoint,
+    FollowedCurve,
+    Reference,
+    TaskKind,
+    TaughtImage,
+)
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_array, check_number, real_numbers
 from servobench.plant.contract.signals import Channel
@@ -26,7 +32,9 @@ Vector: TypeAlias = tuple[float, ...]
 class Scenario:
     """A task made concrete for one true robot."""
 
-    start: FloatArray | None  # (n,), joint positions at time 0; None for a plant that brings its own [rad]
+    start: (
+        FloatArray | None
+    )  # (n,), joint positions at time 0; None for a plant that brings its own [rad]
     reference: Reference  # the desired feature over time
     duration: float  # [s]
     evaluate_from: float  # where the evaluated part begins [s]
@@ -36,10 +44,14 @@ class Scenario:
     def __post_init__(self) -> None:
         """Check that the evaluated part is one of the run, and the kind."""
         if self.kind not in get_args(TaskKind):
-            raise ValueError(f"kind must be one of {', '.join(get_args(TaskKind))}, got {self.kind!r}")
+            raise ValueError(
+                f"kind must be one of {', '.join(get_args(TaskKind))}, got {self.kind!r}"
+            )
         check_number("duration", self.duration, above=0.0)
         if not 0.0 <= real_numbers("evaluate_from", self.evaluate_from) < self.duration:
-            raise ValueError(f"evaluate_from must be in the run of {self.duration:g} s, got {self.evaluate_from:g} s")
+            raise ValueError(
+                f"evaluate_from must be in the run of {self.duration:g} s, got {self.evaluate_from:g} s"
+            )
 
 
 @dataclass(frozen=True)
@@ -83,7 +95,9 @@ class TaskSetting:
             ValueError: the plant brings a robot of its own.
         """
         if self.model is None or self.robot is None:
-            raise ValueError("it is taught on a known robot, and this plant brings a robot of its own")
+            raise ValueError(
+                "it is taught on a known robot, and this plant brings a robot of its own"
+            )
         return self.robot, self.model
 
     def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
@@ -128,7 +142,9 @@ class Task(ABC):
             work: the workspace of the robot.
         """
         given = {each: getattr(self, each) for each in self.places if each != "start"}
-        points = {each: tuple(work.scale * value for value in point) for each, point in given.items()}
+        points = {
+            each: tuple(work.scale * value for value in point) for each, point in given.items()
+        }
         home = {"start": numbers(work.home)} if "start" in self.places else {}
         return replace(self, **points, **home)  # type: ignore[type-var]
 

@@ -28,7 +28,14 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.settings import remark
-from servobench.plant.contract.signals import COMMAND, Command, Observation, PlantSpec, Truth, column_names
+from servobench.plant.contract.signals import (
+    COMMAND,
+    Command,
+    Observation,
+    PlantSpec,
+    Truth,
+    column_names,
+)
 from servobench.plant.robot.hand_eye import RobotModel
 
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
@@ -38,10 +45,13 @@ MAX_DELAY: Final = 0.25  # [s] up to which another delay is tried
 MIN_GAIN: Final = 0.8  # [1] share of the prediction error that another delay leaves, below which it is remarked on
 MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
 MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
-MIN_MOTION: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
+MIN_MOTION: Final = (
+    0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
+)
 MIN_SECOND: Final = 0.1  # share of the first direction of a motion that the second one needs to tell its sides apart
 MAX_LATE: Final = 12  # control periods by which features may be late
-MAX_SHARE_APART: Final = {"m": 0.2, "px": 0.35}  # share of the motion by which features may differ without a remark
+# Share of the motion by which features may differ without a remark
+MAX_SHARE_APART: Final = {"m": 0.2, "px": 0.35}
 
 
 @final
@@ -80,20 +90,28 @@ class LoggedPlant(Plant):
         spec, (excess, where) = self.spec, self.log.farthest_joint()
         if mistake := self.log.joint_mistake():
             raise ConfigurationError(mistake)
-        for found in filter(None, (where * (excess > MAX_EXCESS), self.log.first_jump()[0], self.log.frame_mistake())):
+        for found in filter(
+            None,
+            (where * (excess > MAX_EXCESS), self.log.first_jump()[0], self.log.frame_mistake()),
+        ):
             remark(found)
         for kind, values in (("feature", self.log.features), ("reference", self.reference)):
             sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
             far, size = int(sizes.argmax()), float(sizes.max())
             if unit in ("m", "px") and size > MAX_FEATURE * spec.feature.scale:
                 where = f"row {far} of the log has a {kind} of {size:g} {unit}, beyond any camera"
-                raise ConfigurationError(where + "; if the log is in mm, write it in m" * (unit == "m"))
+                raise ConfigurationError(
+                    where + "; if the log is in mm, write it in m" * (unit == "m")
+                )
         if model is not None and self.log.valid[MAX_LATE:].any():
             self._check_motion(model)
 
     def _check_motion(self, model: RobotModel) -> None:
         """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
-        y, p = (each / self.spec.feature.scale for each in (self.log.features, model.feature(self.log.joints)))
+        y, p = (
+            each / self.spec.feature.scale
+            for each in (self.log.features, model.feature(self.log.joints))
+        )
         rows = len(y) - np.arange(min(MAX_LATE, len(y) // 2))
         valid, unit = self.log.valid, self.spec.feature.unit
         apart, mirrored = min(_apart(y[-k:][valid[-k:]], p[:k][valid[-k:]], unit) for k in rows)
@@ -147,16 +165,22 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         plant = LoggedPlant(spec, table)
         plant.check_units(true)
         log = StepLog(spec, len(table))
-        loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
+        loop = LoopSettings(
+            len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1
+        )
         desired = experiment.desired(loop.periods)
         logged = plant.reference
         if not np.array_equal(desired[: len(logged)], logged):
             desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])
         with careful():
-            run_loop(*held_to_contract(plant, experiment.controller), desired, loop, request.seed, log)
+            run_loop(
+                *held_to_contract(plant, experiment.controller), desired, loop, request.seed, log
+            )
     except RunFault as fault:
         row = len(log.steps())
-        raise ConfigurationError(f"controller {request.controller} fails in row {row} of the log: {fault}") from fault
+        raise ConfigurationError(
+            f"controller {request.controller} fails in row {row} of the log: {fault}"
+        ) from fault
     finally:
         experiment.plant.close()
     rows = log.steps()
@@ -183,7 +207,9 @@ def predicted(steps: Steps, delay: float | None = None) -> FloatArray:
         controller had no Jacobian, and where the joint motion began before the log.
     """
     y, t = np.full_like(steps.feature, np.nan), steps.time
-    late = steps.diagnostics.get(DELAY, np.zeros_like(t)) if delay is None else np.full_like(t, delay)
+    late = (
+        steps.diagnostics.get(DELAY, np.zeros_like(t)) if delay is None else np.full_like(t, delay)
+    )
     frames = np.flatnonzero(steps.feature_valid)
     begin, end = frames[:-1], frames[1:]
     known = (end - begin <= MAX_LATE) & (t[begin] - late[begin] >= t[0])
@@ -225,7 +251,9 @@ def _apart(y: FloatArray, p: FloatArray, unit: str) -> tuple[float, bool]:
         return 1.0, False
     rest, sizes = _rms(y - p @ image), np.linalg.svd(y.T @ p, compute_uv=False)
     sided = len(sizes) in (2, 3) and sizes[1] > MIN_SECOND * sizes[0]
-    return rest / (max(seen, made) if unit == "m" else seen), bool(sided and np.linalg.det(image[:2, :2]) < 0.0)
+    return rest / (max(seen, made) if unit == "m" else seen), bool(
+        sided and np.linalg.det(image[:2, :2]) < 0.0
+    )
 
 
 def differences(steps: pd.DataFrame) -> pd.DataFrame:

@@ -40,7 +40,9 @@ from servobench.plant.robot.robot import Robot
 
 DRAWN_AT_ONCE: Final = 256
 MAX_DRAWS: Final = 25_600
-PLANNED_SHARE: Final = 0.8  # of the images' half sides in which the planned cameras see the features
+PLANNED_SHARE: Final = (
+    0.8  # of the images' half sides in which the planned cameras see the features
+)
 TRUE_SHARE: Final = 0.95  # the same of the true ones
 FACING: Final = 0.7  # cosine of the angle between the target's front and the camera: 45°
 REACHED: Final = 1e-6  # of the error that `reach_pose` returns
@@ -73,8 +75,12 @@ def draw_in_view(
     Raises:
         ValueError: too few postures are fit.
     """
-    least = box.shortest * nominal.noise_unit  # the same way in the image, however near the camera is
-    found, features = np.empty((MAX_DRAWS, robot.n)), np.empty((MAX_DRAWS, len(nominal.channel.names)))
+    # The same way in the image, however near the camera is
+    least = box.shortest * nominal.noise_unit
+    found, features = (
+        np.empty((MAX_DRAWS, robot.n)),
+        np.empty((MAX_DRAWS, len(nominal.channel.names))),
+    )
     count = 0
     for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
         drawn = generator.uniform(box.lower, box.upper, (DRAWN_AT_ONCE, robot.n))
@@ -104,11 +110,19 @@ def drawn_together(
         if _in_view(both, nominal, true).all():
             return (start, target) if tenths == 10 else (both[0], both[1])
     own = robot.camera
-    remedy = f"look at [pose] in {own.name}, whose z axis is the optical axis" if own else "use another mismatch"
-    raise ValueError(f"start and target must be in view, and near the arm's home they are not; {remedy}")
+    remedy = (
+        f"look at [pose] in {own.name}, whose z axis is the optical axis"
+        if own
+        else "use another mismatch"
+    )
+    raise ValueError(
+        f"start and target must be in view, and near the arm's home they are not; {remedy}"
+    )
 
 
-def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:
+def _fit(
+    drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: SetupModel
+) -> npt.NDArray[np.bool_]:
     """Return which of the postures (k, n) rad are fit, (k,)."""
     fit = robot.arm.ball_position(drawn)[:, 2] >= box.lowest
     if robot.workspace.clear is not None:
@@ -120,8 +134,11 @@ def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: S
 def _in_view(postures: FloatArray, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:
     """Return in which postures (k, n) rad the cameras see all features as they should, (k,)."""
     points = nominal.points(postures)
-    planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1) & (nominal.incidence(points) >= FACING)
-    share = TRUE_SHARE if nominal.planned == CAMERA else PLANNED_SHARE  # marks may be larger in a user's image
+    planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1) & (
+        nominal.incidence(points) >= FACING
+    )
+    # Marks may be larger in a user's image
+    share = TRUE_SHARE if nominal.planned == CAMERA else PLANNED_SHARE
     return np.asarray(planned & true.valid_at(true.points(postures), share).all(axis=-1))
 
 
@@ -141,7 +158,11 @@ class PoseTask(Task):
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         robot, true = setting.taught_on()
-        if not (isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel) and true.setup.judges_pose):
+        if not (
+            isinstance(true, SetupModel)
+            and isinstance(setting.nominal, SetupModel)
+            and true.setup.judges_pose
+        ):
             raise ValueError("it needs a target with a pose; use the sensing plate or plate:hand")
         start = pose_start(self, robot, setting.nominal)
         return setting.move(start, setting.taught(robot.workspace.home), self.duration)
@@ -176,16 +197,23 @@ def pose_start(config: PoseTask, robot: Robot, nominal: SetupModel) -> FloatArra
         start = _led(config, share, robot, nominal, middle)
         if start is not None and nominal.valid_at(nominal.points(start), IN_VIEW).all():
             return start
-    raise ValueError(f"{robot.title} cannot reach the start of {config.displacement} with the target in view")
+    raise ValueError(
+        f"{robot.title} cannot reach the start of {config.displacement} with the target in view"
+    )
 
 
-def _led(config: PoseTask, share: float, robot: Robot, nominal: SetupModel, middle: FloatArray) -> FloatArray | None:
+def _led(
+    config: PoseTask, share: float, robot: Robot, nominal: SetupModel, middle: FloatArray
+) -> FloatArray | None:
     """Return the joint positions at a share of the displacement, led there from home in steps; None if out of reach."""
     arm, limits, q, camera = robot.arm, robot.limits, robot.workspace.home, nominal.camera
     at_home = arm.frames(q)[-1]
     for step in np.linspace(0.0, share, STEPS + 1)[1:].tolist():
-        D = displaced(replace(config, angle=step * config.angle, nearer=step * config.nearer), middle)
-        moved = camera @ D @ np.linalg.inv(camera)  # of the target in the frame that the camera is mounted on
+        D = displaced(
+            replace(config, angle=step * config.angle, nearer=step * config.nearer), middle
+        )
+        # of the target in the frame that the camera is mounted on
+        moved = camera @ D @ np.linalg.inv(camera)
         pose = moved @ at_home if nominal.mount == "fixed" else at_home @ np.linalg.inv(moved)
         q, error = reach_pose(arm, pose, q, limits.lower, limits.upper)
         if error > REACHED:

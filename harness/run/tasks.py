@@ -26,7 +26,15 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.settings import Count, Duration, NonNegative, Number, Positive, remark, settings
+from servobench.plant.contract.settings import (
+    Count,
+    Duration,
+    NonNegative,
+    Number,
+    Positive,
+    remark,
+    settings,
+)
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
@@ -59,10 +67,15 @@ class PointTask(Task):
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         start, target = (
-            as_array(f"its setting {name}", getattr(self, name), (setting.n,)) for name in ("start", "target")
+            as_array(f"its setting {name}", getattr(self, name), (setting.n,))
+            for name in ("start", "target")
         )
         robot, true = setting.taught_on()
-        if self.into_view and isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
+        if (
+            self.into_view
+            and isinstance(true, SetupModel)
+            and isinstance(setting.nominal, SetupModel)
+        ):
             start, target = drawn_together(start, target, robot, setting.nominal, true)
         return setting.move(start, setting.taught(target), self.duration)
 
@@ -117,7 +130,10 @@ class RandomTask(Task):
         """See `Task.scenario`."""
         robot, true = setting.taught_on()
         n, clear = robot.n, robot.workspace.clear
-        lower, upper = (as_array(f"its setting {name}", getattr(self, name), (n,)) for name in ("lower", "upper"))
+        lower, upper = (
+            as_array(f"its setting {name}", getattr(self, name), (n,))
+            for name in ("lower", "upper")
+        )
         if not (lower < upper).all():
             raise ValueError("lower must be below upper for every joint")
         generator = named_generator(setting.seed, "start_and_target")
@@ -137,7 +153,9 @@ class RandomTask(Task):
                 if _stays_in_reach(point, self.lowest, setting, robot):
                     return setting.move(start, FixedPoint(point), self.duration)
         least = f"apart by shortest = {self.shortest:g} m and above the table by lowest = {self.lowest:g} m"
-        raise ValueError(f"no start and target between lower and upper are {least}; lessen these, or widen the box")
+        raise ValueError(
+            f"no start and target between lower and upper are {least}; lessen these, or widen the box"
+        )
 
     def scaled(self, name: str, work: Workspace) -> Self:
         """See `Task.scaled`."""
@@ -205,7 +223,10 @@ class LineTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        begin, end = (as_array(f"its setting {name}", getattr(self, name), (setting.m,)) for name in ("begin", "end"))
+        begin, end = (
+            as_array(f"its setting {name}", getattr(self, name), (setting.m,))
+            for name in ("begin", "end")
+        )
         reference = setting.followed(line(begin, end, self.moving))
         return Scenario(setting.start(self.start), reference, self.duration, 0.5 * self.duration)
 
@@ -242,29 +263,57 @@ def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, rob
     if not isinstance(setting.moved, HandEyeModel):
         return True
     point, (nearest, farthest) = setting.moved.to_base(target), robot.workspace.reach
-    return bool(point[2] >= lowest and nearest <= np.linalg.norm(point - robot.workspace.shoulder) <= farthest)
+    return bool(
+        point[2] >= lowest
+        and nearest <= np.linalg.norm(point - robot.workspace.shoulder) <= farthest
+    )
 
 
 EXP1, EXP2, EXP3, EXP4 = (PointTask(start=start, target=target) for start, target in MOVES.values())
-UNREACHABLE: Final = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)  # 1.5 m straight on from the ball's start
+# 1.5 m straight on from the ball's start
+UNREACHABLE: Final = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)
 
 _ENTRIES = (
     TaskEntry("exp1", "a move whose target lies outside the training region", EXP1),
     TaskEntry("exp2", "a move inside the training region, forward and down", EXP2),
     TaskEntry("exp3", "a move inside the training region, across and up", EXP3),
     TaskEntry("exp4", "a move that starts outside the training region", EXP4),
-    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CurveTask(radius=RADII["circle"])),
+    TaskEntry(
+        "circle",
+        "two laps on a horizontal circle of 0.3 m radius",
+        CurveTask(radius=RADII["circle"]),
+    ),
     TaskEntry("line", "a straight line at constant speed", LineTask()),
-    TaskEntry("lemniscate", "two laps on a figure of eight", CurveTask("lemniscate", radius=RADII["lemniscate"])),
-    TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask()),
+    TaskEntry(
+        "lemniscate",
+        "two laps on a figure of eight",
+        CurveTask("lemniscate", radius=RADII["lemniscate"]),
+    ),
+    TaskEntry(
+        "random", "start and target drawn by the seed from the training region", RandomTask()
+    ),
     TaskEntry("target", "a move to a given feature (target.target)", TargetTask()),
     TaskEntry("endurance", "half an hour on the circle or the lemniscate", CurveTask(laps=180)),
-    TaskEntry("unreachable", "a target 1.5 m away, out of the arm's reach", UNREACHABLE, out_of_reach=True),
-    TaskEntry(STRETCHED_START, "a move that starts with the arm stretched", PointTask(start=STRETCHED)),
-    TaskEntry("axis_turn", "of a plate: a turn about the optical axis by 45°", PoseTask("axis_turn")),
+    TaskEntry(
+        "unreachable", "a target 1.5 m away, out of the arm's reach", UNREACHABLE, out_of_reach=True
+    ),
+    TaskEntry(
+        STRETCHED_START, "a move that starts with the arm stretched", PointTask(start=STRETCHED)
+    ),
+    TaskEntry(
+        "axis_turn", "of a plate: a turn about the optical axis by 45°", PoseTask("axis_turn")
+    ),
     TaskEntry("retreat", "of a plate: away along the optical axis", PoseTask("retreat")),
-    TaskEntry("camera_turn", "of a plate: a turn about the camera's y axis by 15°", PoseTask("camera_turn", 15.0)),
-    TaskEntry("plane_turn", "of a plate: a turn about an axis in its plane by 30°", PoseTask("plane_turn", 30.0)),
+    TaskEntry(
+        "camera_turn",
+        "of a plate: a turn about the camera's y axis by 15°",
+        PoseTask("camera_turn", 15.0),
+    ),
+    TaskEntry(
+        "plane_turn",
+        "of a plate: a turn about an axis in its plane by 30°",
+        PoseTask("plane_turn", 30.0),
+    ),
     TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask()),
 )
 TASKS = {entry.name: entry for entry in _ENTRIES}
@@ -279,7 +328,9 @@ def _checked(entry: TaskEntry, place: str) -> TaskEntry:
     default: object = entry.default
     if not (isinstance(default, Task) and is_dataclass(type(default))):
         came = type(default).__name__
-        raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got {came}")
+        raise ConfigurationError(
+            f"{place}: the settings of a task must be a dataclass below Task, got {came}"
+        )
     return entry
 
 

@@ -17,15 +17,23 @@ from servobench.plant.robot.twin import TIMES
 MIN_TIMES: Final = 1e-3  # [s] of delay and lag, below which no drive is
 MIN_DEVIATION: Final = 1e-4  # [s] of delay and lag, as they are printed
 SHOWN: Final = 0.05  # [1] of the largest entry of a direction, from which a parameter is named
-WHITE: Final = 3.0  # [1] deviations of a correlation from none, up to which residuals count as white
+WHITE: Final = (
+    3.0  # [1] deviations of a correlation from none, up to which residuals count as white
+)
 CERTAIN: Final = 5.0  # [1] deviations from none of backlash, ripple, a soft tool and the like
 MIN_LATE: Final = 0.02  # [s] by which frames must be late by changing times
 MAX_SPREAD: Final = 0.05  # [s] of these times that is no outlier
 SLOW_SHARE: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
-LATE_RATIO: Final = 0.2  # [1] median over mean of squared errors, above which fast frames are late and not false
+LATE_RATIO: Final = (
+    0.2  # [1] median over mean of squared errors, above which fast frames are late and not false
+)
 BURST_RATIO: Final = 2.0  # [1] lost frames in a row over those of independent losses
-MIN_ODD: Final = 0.05  # [1] of the usual gaps between frames, from which others belong to the camera's period
-ODD_GAPS: Final = 12.0  # of a steady camera, within which the lateness of its frames changes by less than UNEVEN
+MIN_ODD: Final = (
+    0.05  # [1] of the usual gaps between frames, from which others belong to the camera's period
+)
+ODD_GAPS: Final = (
+    12.0  # of a steady camera, within which the lateness of its frames changes by less than UNEVEN
+)
 MIN_PART: Final = 1e-3  # [rows] from which the distance of frames is no whole number of rows
 UNEVEN: Final = 2.0  # [rows]
 JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s]
@@ -42,13 +50,19 @@ def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
         (name, 1e3 * value, 1e3 * max(deviation, MIN_DEVIATION), "ms")
         for name, value, deviation in zip(TIMES[1:], response[:2], np.sqrt(np.diag(response.covariance)), strict=True)
     ]  # fmt: skip
-    for name, value, deviation, told in zip(robot.names, robot.values, robot.deviations, robot.told, strict=True):
+    for name, value, deviation, told in zip(
+        robot.names, robot.values, robot.deviations, robot.told, strict=True
+    ):
         unit, per = UNITS.get(kind_of(name), ("", 1.0))
         rows += [(name, per * value, per * deviation, unit)] if told and name not in EXTRAS else []
     table = pd.DataFrame(rows, columns=["parameter", "estimate", "deviation", "unit"])
     digits = np.maximum(0, 1 - np.floor(np.log10(2.0 * table["deviation"]))).astype(int)
-    table["± 95 %"] = [f"{1.96 * each:.{n}f}" for each, n in zip(table.pop("deviation"), digits, strict=True)]
-    table["estimate"] = [f"{each:z.{n}f}" for each, n in zip(table["estimate"], digits, strict=True)]
+    table["± 95 %"] = [
+        f"{1.96 * each:.{n}f}" for each, n in zip(table.pop("deviation"), digits, strict=True)
+    ]
+    table["estimate"] = [
+        f"{each:z.{n}f}" for each, n in zip(table["estimate"], digits, strict=True)
+    ]
     return table[["parameter", "estimate", "± 95 %", "unit"]]
 
 
@@ -69,21 +83,34 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
     if response is None:
         lines.append(f"not told: delay and lag, as {untold_response(log)}")
     elif response.delay + response.lag < MIN_TIMES:
-        lines.append("joints follow commands at once: these are likely their measured speeds; log what was sent")
+        lines.append(
+            "joints follow commands at once: these are likely their measured speeds; log what was sent"
+        )
     elif response.unexplained > SUSPECT:
-        lines.append(f"delay and lag leave {response.unexplained:.0%} of joint motion: the drive is no first-order lag")
+        lines.append(
+            f"delay and lag leave {response.unexplained:.0%} of joint motion: the drive is no first-order lag"
+        )
     if response is not None and response.level < math.inf:
-        lines.append(f"commands act as if clipped at {response.level:.3g} rad/s: log them as they are sent")
+        lines.append(
+            f"commands act as if clipped at {response.level:.3g} rad/s: log them as they are sent"
+        )
     for section, settings in sensor(log, robot).settings.items():
         words = ", ".join(f"{section}.{name}={value:.3g}" for name, value in settings.items())
         lines.append(f"settings of a plant: {words}")
     if far := robot.unlikely():
         lines.append(f"far from the nominal robot: {', '.join(far)}; is it this arm?")
     lines += [f"not told: {each}" for each in untold_combinations(robot)]
-    told = [name for name, told in zip(robot.names, robot.told, strict=True) if told and name not in EXTRAS]
+    told = [
+        name
+        for name, told in zip(robot.names, robot.told, strict=True)
+        if told and name not in EXTRAS
+    ]
     share, widest = max((robot.estimate(name)[1] / prior(name), name) for name in told)
-    longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)  # as the prior is no part of a log's information
-    lines.append(f"at most {longer:.0f} s more of such motion would halve the widest interval, that of {widest}")
+    # As the prior is no part of a log's information
+    longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)
+    lines.append(
+        f"at most {longer:.0f} s more of such motion would halve the widest interval, that of {widest}"
+    )
     return lines
 
 
@@ -164,8 +191,14 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     """
     found = {name: value for name, (value, deviation) in ((name, robot.estimate(name)) for name in EXTRAS)
              if abs(value) > CERTAIN * deviation}  # fmt: skip
-    mechanics: dict[str, float] = {name: abs(found[name]) for name in ("backlash", "ripple") if name in found}
-    mechanics |= {"tool_frequency": found["compliance"] ** -0.5} if found.get("compliance", 0.0) > 1e-12 else {}
+    mechanics: dict[str, float] = {
+        name: abs(found[name]) for name in ("backlash", "ripple") if name in found
+    }
+    mechanics |= (
+        {"tool_frequency": found["compliance"] ** -0.5}
+        if found.get("compliance", 0.0) > 1e-12
+        else {}
+    )
     sensing = {"camera_turn": found["turning"]} if found.get("turning", 0.0) > 0.0 else {}
     swing = math.hypot(found.get("swing_sin", 0.0), found.get("swing_cos", 0.0))
     spread, steady, kept = _lateness(log, robot)
@@ -184,13 +217,16 @@ def sensor(log: Log, robot: Identified) -> Sensor:
         sensing |= {"occlusions": lost, "occlusion_duration": gap * frame_period(log)}
         lost = 0.0
     rows = frame_period(log) / log.spec.period
-    wait = 0.5 * log.spec.period if abs(rows - round(rows)) > MIN_PART else 0.0  # until the next control instant
+    # Until the next control instant
+    wait = 0.5 * log.spec.period if abs(rows - round(rows)) > MIN_PART else 0.0
     if waiting.mean:
         wait = waiting.mean
         noise, outliers, lost = steady, ~kept, max(0.0, lost - waiting.missing)
     latency = max(0.0, robot.estimate("latency")[0] - wait)  # an estimate of 0 may fall below it
     sections: dict[str, dict[str, float]] = {"sensing": sensing, "mechanics": mechanics}
-    return Sensor(latency, noise, outliers, lost, {name: own for name, own in sections.items() if own})
+    return Sensor(
+        latency, noise, outliers, lost, {name: own for name, own in sections.items() if own}
+    )
 
 
 def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray]:
@@ -207,7 +243,10 @@ def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray
     deviation = float(np.linalg.norm(apart * (left - np.average(left, weights=weight)))) / size
     share = max(float(np.mean(left[slow])) / usual, 0.1)
     fast = kept & (speed > np.median(speed))  # outliers enlarge few of them, lateness most
-    late = slope > CERTAIN * deviation and float(np.median(square[fast] / (slope * speed[fast]))) > LATE_RATIO
+    late = (
+        slope > CERTAIN * deviation
+        and float(np.median(square[fast] / (slope * speed[fast]))) > LATE_RATIO
+    )
     return (slope**0.5 if late else 0.0), share * np.cov(robot.residuals[slow].T), kept
 
 
@@ -220,12 +259,16 @@ class Waiting(NamedTuple):
     swing: float = 0.0  # [s] of a fit to the frames that are seen
 
 
-def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: float = 1.0) -> Waiting:
+def arrivals(
+    period: float, jitter: float, swing: float = 0.0, swing_period: float = 1.0
+) -> Waiting:
     """Return the times of frames that are late by A (1 + sin(2π t/P)) + U(0, jitter), as the bench delivers them."""
     instants = np.arange(4000.0)
     late = swing * (1.0 + np.sin(2.0 * np.pi * period * instants / swing_period))
     late += jitter * np.random.default_rng(0).random(len(instants))
-    newest = np.searchsorted(np.maximum.accumulate(instants + late / period), instants, side="right") - 1
+    newest = (
+        np.searchsorted(np.maximum.accumulate(instants + late / period), instants, side="right") - 1
+    )
     new = np.diff(newest, prepend=-1) > 0
     age = period * (instants - newest)[new]
     wave = np.sin(2.0 * np.pi * period * newest[new] / swing_period)
@@ -233,7 +276,9 @@ def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: flo
     return Waiting(float(age.mean()), float(age.std()), 1.0 - len(age) / len(instants), size)
 
 
-def twin_text(robot: Identified, log: Log, response: Response | None, named: tuple[str, str]) -> str:
+def twin_text(
+    robot: Identified, log: Log, response: Response | None, named: tuple[str, str]
+) -> str:
     """Return the file of a twin.
 
     Args:
@@ -250,9 +295,16 @@ def twin_text(robot: Identified, log: Log, response: Response | None, named: tup
         mean |= {"command_delay": response.delay, "lag": response.lag}
         values, vectors = np.linalg.eigh(response.covariance)
         times = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-        factor = np.block([[factor, np.zeros((len(factor), 2))], [np.zeros((2, len(names))), times]])
+        factor = np.block(
+            [[factor, np.zeros((len(factor), 2))], [np.zeros((2, len(names))), times]]
+        )
         names += TIMES[1:]
-    top: dict[str, Any] = {"robot": named[0], "sensing": named[1], "covariance": told.noise, "lost_frames": told.lost}
+    top: dict[str, Any] = {
+        "robot": named[0],
+        "sensing": named[1],
+        "covariance": told.noise,
+        "lost_frames": told.lost,
+    }
     if told.outliers.any():
         size = float(np.sqrt(np.mean(robot.residuals[told.outliers] ** 2)))
         top |= {"outliers": float(told.outliers.mean()), "outlier_size": size}

@@ -18,8 +18,10 @@ from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
 
-STAMP: Final = re.compile(rb"Script Loaded \(([\w.: -]{1,40})\)")  # the date that a control script has in it
-SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")  # which no line of HTTP has, with any method
+# The date that a control script has in it
+STAMP: Final = re.compile(rb"Script Loaded \(([\w.: -]{1,40})\)")
+# Which no line of HTTP has, with any method
+SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")
 COMMAND: Final = "input_int_register_0"
 COMMANDS: Final = CONTROLLER["commands"]["names"].split()
 WITHOUT_ANSWER: Final = frozenset(CONTROLLER["commands"]["without_answer"])
@@ -27,15 +29,24 @@ STOP_DECELERATION: Final = 10.0  # [rad/s²] of an arm whose program ended
 LONGEST_MOVE: Final = 300.0  # [s] with its settling
 POSITION_GAIN: Final = 5.0  # [1/s] of moveJ, with which such a drive does not swing
 POSITION_TOLERANCE: Final = 1e-3  # [rad] within which moveJ has arrived
-UNLOCK_AFTER: Final = 5.0  # [s] that a protective stop lasts at least, by UR's page on the dashboard server
+UNLOCK_AFTER: Final = (
+    5.0  # [s] that a protective stop lasts at least, by UR's page on the dashboard server
+)
 
 
 def script_version(script: bytes) -> tuple[str, bool]:
     """Return words for the version of `ur-rtde` that sends a control script, and whether this one is served."""
-    digest, stamp, known = hashlib.sha256(script).hexdigest(), STAMP.search(script), CONTROLLER["scripts"]
+    digest, stamp, known = (
+        hashlib.sha256(script).hexdigest(),
+        STAMP.search(script),
+        CONTROLLER["scripts"],
+    )
     if digest in known:
         return f"ur-rtde {known[digest]}", digest == next(iter(known))
-    return f"{len(script)} bytes, dated {stamp[1].decode() if stamp else 'nowhere'}, SHA-256 {digest[:12]}…", False
+    return (
+        f"{len(script)} bytes, dated {stamp[1].decode() if stamp else 'nowhere'}, SHA-256 {digest[:12]}…",
+        False,
+    )
 
 
 def begins_script(text: bytes) -> bool:
@@ -45,14 +56,17 @@ def begins_script(text: bytes) -> bool:
     return b"def ".startswith(text[:4])
 
 
-def profile(distance: float, speed: float, acceleration: float) -> tuple[float, Callable[[float], float]]:
+def profile(
+    distance: float, speed: float, acceleration: float
+) -> tuple[float, Callable[[float], float]]:
     """Return the duration [s] of a trapezoidal move in rad, rad/s and rad/s², and the share done at a time [s]."""
     rise = min(speed / acceleration, math.sqrt(distance / acceleration))
     top = acceleration * rise
     duration = rise + distance / max(top, 1e-300) if distance > 0.0 else 0.0
 
     def done(t: float) -> float:
-        short = max(0.0, min(t, duration - t))  # the way of the second half is that of the first, backwards
+        # The way of the second half is that of the first, backwards
+        short = max(0.0, min(t, duration - t))
         way = top * (short - rise / 2.0) if short > rise else acceleration * short * short / 2.0
         share = way / distance if distance > 0.0 else 0.0
         return share if 2.0 * t < duration else 1.0 - share
@@ -74,7 +88,9 @@ class ControlProgram:
         busy: whether a motion is under way that ends by itself.
     """
 
-    def __init__(self, spec: PlantSpec, drive: TrueModel, say: Callable[[str], None], *, lockstep: bool) -> None:
+    def __init__(
+        self, spec: PlantSpec, drive: TrueModel, say: Callable[[str], None], *, lockstep: bool
+    ) -> None:
         """Take spec and drive of the plant, and a printer of lines; in lockstep accelerations have no limit."""
         self._spec, self._drive, self._say, self._lockstep = spec, drive, say, lockstep
         self.inputs: dict[str, Any] = {}
@@ -165,7 +181,9 @@ class ControlProgram:
             self.stop(f"at {name}: {error}")
 
     def _numbers(self, first: int, count: int) -> FloatArray:
-        numbers = np.array([self.inputs.get(f"input_double_register_{first + k}", 0.0) for k in range(count)])
+        numbers = np.array(
+            [self.inputs.get(f"input_double_register_{first + k}", 0.0) for k in range(count)]
+        )
         if not np.isfinite(numbers).all():
             raise ValueError(f"its numbers must be finite, got {numbers.tolist()}")
         return numbers
@@ -178,7 +196,9 @@ class ControlProgram:
     def _reachable(self) -> FloatArray:
         target, spec = self._numbers(0, self._spec.n), self._spec
         if ((target < spec.joint_lower) | (target > spec.joint_upper)).any():
-            raise ValueError(f"its target must be within the joints' limits, got {target.tolist()} rad")
+            raise ValueError(
+                f"its target must be within the joints' limits, got {target.tolist()} rad"
+            )
         return target
 
     def _move(self) -> Iterator[FloatArray]:
@@ -187,7 +207,9 @@ class ControlProgram:
             raise ValueError("asynchronous moves are not served")
         start, target, period = self.joints, self._reachable(), self._spec.period
         speed = min(self._rate("speed", 6), float(self._spec.joint_velocity_limit.min()))
-        duration, done = profile(float(np.abs(target - start).max()), speed, self._rate("acceleration", 7))
+        duration, done = profile(
+            float(np.abs(target - start).max()), speed, self._rate("acceleration", 7)
+        )
         if not duration < LONGEST_MOVE:
             raise ValueError(f"its move must take less than {LONGEST_MOVE:g} s, got {duration:g} s")
         self.busy = True
@@ -197,10 +219,14 @@ class ControlProgram:
                 if k * period >= duration:
                     if np.abs(target - self.joints).max() < POSITION_TOLERANCE:
                         return
-                    if not self._lockstep:  # a UR answers at the end of the profile, and its drives follow
+                    if (
+                        not self._lockstep
+                    ):  # a UR answers at the end of the profile, and its drives follow
                         self._arrive()
                 now, then, later = (done((k + ahead) * period) for ahead in range(3))
-                rate = (then - now) / period + (self._drive.lag or 0.0) * (later - 2.0 * then + now) / period**2
+                rate = (then - now) / period + (self._drive.lag or 0.0) * (
+                    later - 2.0 * then + now
+                ) / period**2
                 there = start + (target - start) * done(k * period - self._drive.command_delay)
                 yield (target - start) * rate + POSITION_GAIN * (there - self.joints)
 
@@ -208,18 +234,25 @@ class ControlProgram:
 
     def _speed(self) -> Iterator[FloatArray]:
         limit, wanted = self._spec.joint_velocity_limit, self._numbers(0, self._spec.n)
-        return self._ramp(np.clip(wanted, -limit, limit), self._rate("acceleration", 6), forever=True)
+        return self._ramp(
+            np.clip(wanted, -limit, limit), self._rate("acceleration", 6), forever=True
+        )
 
     def _servo(self) -> Iterator[FloatArray]:
         """Approach a position with the look-ahead time as time constant."""
-        target, time_constant = self._reachable(), max(self._rate("lookahead_time", 9), self._spec.period)
+        target, time_constant = (
+            self._reachable(),
+            max(self._rate("lookahead_time", 9), self._spec.period),
+        )
         return ((target - self.joints) / time_constant for _ in count())
 
     def _halt(self) -> Iterator[FloatArray]:
         self.busy = True
         return self._ramp(self._rest, self._rate("deceleration", 0))
 
-    def _ramp(self, target: FloatArray, acceleration: float, *, forever: bool = False) -> Iterator[FloatArray]:
+    def _ramp(
+        self, target: FloatArray, acceleration: float, *, forever: bool = False
+    ) -> Iterator[FloatArray]:
         """Yield velocities from the present one to a target; the joint that changes most has the acceleration."""
         change = math.inf if self._lockstep else acceleration * self._spec.period
         while forever or self.velocity.any():

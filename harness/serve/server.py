@@ -35,7 +35,8 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 
 Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
-PORTS: Final = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}  # all but the last are UR's
+# All but the last are UR's
+PORTS: Final = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}
 RATE: Final = 500.0  # [Hz] of the controller of an e-Series robot
 HEARTBEAT: Final = 0.004  # [s] between two packets while lockstep waits
 BACKLOG: Final = 0.1  # [s] behind the wall clock from which the backlog is dropped
@@ -72,7 +73,12 @@ class Server:
     """
 
     def __init__(
-        self, request: RunRequest, settings: Settings, say: Callable[[str], None], *, lockstep: bool = False
+        self,
+        request: RunRequest,
+        settings: Settings,
+        say: Callable[[str], None],
+        *,
+        lockstep: bool = False,
     ) -> None:
         """Begin a run. In real time its plant advances at the rate of a UR, and frames come once a control period.
 
@@ -85,7 +91,9 @@ class Server:
         check_settings(settings, [request.plant, request.task])
         resolved, self._arm = resolve(request, settings), find_robot(request.robot).arm
         if self._arm.n != 6:
-            raise ConfigurationError(f"--robot must be one with 6 joints, as every UR has, got {self._arm.n}")
+            raise ConfigurationError(
+                f"--robot must be one with 6 joints, as every UR has, got {self._arm.n}"
+            )
         sensing, frames = getattr(resolved.plant, "sensing", None), resolved.run.period
         if not lockstep:
             if isinstance(sensing, SensingConfig):
@@ -98,17 +106,27 @@ class Server:
         self._plant, self._spec = experiment.plant, experiment.plant.spec
         first = self._plant.reset(named_seed(request.seed, "plant"))
         self.rollout = Rollout(self._plant, first, experiment.desired(), experiment.loop)
-        self._frames, self._say, self._lockstep = max(1, round(frames / self._spec.period)), say, lockstep
-        drive = self._plant.with_delays(TrueModel(lambda q: q, lambda q: q))  # for its lag and its command delay
+        self._frames, self._say, self._lockstep = (
+            max(1, round(frames / self._spec.period)),
+            say,
+            lockstep,
+        )
+        # For its lag and its command delay
+        drive = self._plant.with_delays(TrueModel(lambda q: q, lambda q: q))
         self.program = ControlProgram(self._spec, drive, say, lockstep=lockstep)
         self._clients: set[Client] = set()
         self._watchers: dict[StreamWriter, bool] = {}  # of features, and whether they want pictures
         self._open: dict[str, set[StreamWriter]] = {port: set() for port in PORTS}
-        self._silent: dict[StreamWriter, str] = {}  # ports of connections that said nothing whole yet, oldest first
+        self._silent: dict[
+            StreamWriter, str
+        ] = {}  # ports of connections that said nothing whole yet, oldest first
         self._crowded: set[str] = set()  # ports at which a connection had to give way
         self._fault: str | None = None
         self._sent, self._untold, self._turn = 0, 0, asyncio.Event()
-        self.state: dict[str, Any] = {**wire.CONTROLLER["constant"], "actual_digital_output_bits": 0}
+        self.state: dict[str, Any] = {
+            **wire.CONTROLLER["constant"],
+            "actual_digital_output_bits": 0,
+        }
         self._measure()
 
     async def serve(self, address: str) -> None:
@@ -118,7 +136,12 @@ class Server:
             ConfigurationError: a port that cannot be opened.
         """
         with ExitStack() as stack:
-            handlers: tuple[Handler, ...] = (self._rtde, self._dashboard, self._script, self._features)
+            handlers: tuple[Handler, ...] = (
+                self._rtde,
+                self._dashboard,
+                self._script,
+                self._features,
+            )
             for handler, (name, port) in zip(handlers, PORTS.items(), strict=True):
                 guarded = partial(self._guard, name, handler)
                 try:
@@ -127,14 +150,21 @@ class Server:
                     remedy = "serve at another address of this machine, such as --address 127.0.0.2"
                     if error.errno == errno.EADDRINUSE:
                         remedy = f"end what uses it, or {remedy}"
-                    why = reason(error) if (error.errno or 0) < 0 else os.strerror(error.errno or 0)  # of the address
+                    # of the address
+                    why = reason(error) if (error.errno or 0) < 0 else os.strerror(error.errno or 0)
                     failed = f"{name} port {port} of {address} cannot be opened: {why}"
                     raise ConfigurationError(f"{failed}; {remedy}") from error
                 stack.callback(server.close)
             if not ipaddress.ip_address(address).is_loopback:
-                self._say(f"warning: whoever reaches {address} can move this plant; there is no password")
+                self._say(
+                    f"warning: whoever reaches {address} can move this plant; there is no password"
+                )
             ports = ", ".join(f"{name} {port}" for name, port in PORTS.items())
-            clocked = "lockstep" if self._lockstep else f"real time, in steps of {1e3 * self._spec.period:g} ms,"
+            clocked = (
+                "lockstep"
+                if self._lockstep
+                else f"real time, in steps of {1e3 * self._spec.period:g} ms,"
+            )
             self._say(f"serving in {clocked} at {address}: {ports}")
             self._say("conformance with ur-rtde 1.6.5 is checked, safety is not; Ctrl-C ends it")
             clock = asyncio.get_running_loop().time
@@ -145,7 +175,9 @@ class Server:
                 else:
                     due += self._spec.period
                     if (late := clock() - due) > BACKLOG:
-                        self._say(f"the plant is slower than the wall clock: {1e3 * late:.0f} ms are left out")
+                        self._say(
+                            f"the plant is slower than the wall clock: {1e3 * late:.0f} ms are left out"
+                        )
                         due += late
                     await asyncio.sleep(max(0.0, due - clock()))
                     self.program.cycle()
@@ -153,7 +185,9 @@ class Server:
                     self._advance()
                 self._publish()
 
-    async def _guard(self, port: str, handler: Handler, reader: StreamReader, writer: StreamWriter) -> None:
+    async def _guard(
+        self, port: str, handler: Handler, reader: StreamReader, writer: StreamWriter
+    ) -> None:
         """Close a connection with a line where its bytes make no sense, and without one where its other end is gone."""
         if not self._has_room(port):
             writer.transport.abort()
@@ -171,7 +205,9 @@ class Server:
             self._watchers.pop(writer, None)
             self._silent.pop(writer, None)
             self._open[port].discard(writer)
-            if writer.transport.get_write_buffer_size():  # a client that never reads would keep it open
+            if (
+                writer.transport.get_write_buffer_size()
+            ):  # a client that never reads would keep it open
                 writer.transport.abort()
             writer.close()
 
@@ -181,7 +217,9 @@ class Server:
             return True
         if port not in self._crowded:
             self._crowded.add(port)
-            self._say(f"{port}: {CONNECTIONS} connections are open; silent ones give way, others are refused")
+            self._say(
+                f"{port}: {CONNECTIONS} connections are open; silent ones give way, others are refused"
+            )
         for writer, name in self._silent.items():
             if name == port:
                 del self._silent[writer]
@@ -202,7 +240,11 @@ class Server:
             else:
                 self._measure()
                 self._untold += 1
-                if self._lockstep or self.rollout.observation.valid.any() or self._untold > self._frames:
+                if (
+                    self._lockstep
+                    or self.rollout.observation.valid.any()
+                    or self._untold > self._frames
+                ):
                     self._untold = 0
                     self._tell(self._watchers)
 
@@ -212,7 +254,11 @@ class Server:
         self.program.joints = now.joint_position
         flange = self._arm.frames(now.joint_position)[-1]
         pose = (*flange[:3, 3], *cv2.Rodrigues(flange[:3, :3])[0].ravel())
-        moving = (now.joint_position - before) / self._spec.period if now.time > 0.0 else wire.ZEROS["VECTOR6D"]
+        moving = (
+            (now.joint_position - before) / self._spec.period
+            if now.time > 0.0
+            else wire.ZEROS["VECTOR6D"]
+        )
         self.state |= {
             "timestamp": now.time, "actual_q": now.joint_position, "target_q": now.joint_position, "actual_qd": moving,
             "target_qd": self.program.velocity, "actual_TCP_pose": pose, "target_TCP_pose": pose,
@@ -276,7 +322,9 @@ class Server:
 
     def _subscribe(self, own: Client, body: bytes) -> bytes:
         """Take the recipe of the outputs that a client wants."""
-        if own.version == 0 and body[:1].isalpha():  # as no frequency begins: version 1, with which a UR begins
+        if (
+            own.version == 0 and body[:1].isalpha()
+        ):  # as no frequency begins: version 1, with which a UR begins
             own.version = 1
         frequency = LEGACY_FREQUENCY
         names = body
@@ -295,12 +343,23 @@ class Server:
     def _admit(self, own: Client, body: bytes) -> bytes:
         """Take a recipe of inputs of a client, if no other client writes one of them."""
         recipe = self._recipe(body, wire.INPUTS)
-        taken = {name for each in self._clients - {own} for inputs in each.inputs for name in inputs.names}
-        if COMMAND in taken:  # a program can be commanded by the lower or the upper range of registers
+        taken = {
+            name
+            for each in self._clients - {own}
+            for inputs in each.inputs
+            for name in inputs.names
+        }
+        if (
+            COMMAND in taken
+        ):  # a program can be commanded by the lower or the upper range of registers
             taken.add("input_int_register_24")
-        types = ["IN_USE" if name in taken else recipe.types[k] for k, name in enumerate(recipe.names)]
+        types = [
+            "IN_USE" if name in taken else recipe.types[k] for k, name in enumerate(recipe.names)
+        ]
         if "IN_USE" in types:
-            self._say(f"a second client is refused: another one writes {recipe.names[types.index('IN_USE')]}")
+            self._say(
+                f"a second client is refused: another one writes {recipe.names[types.index('IN_USE')]}"
+            )
         elif wire.NOT_FOUND not in types and len(own.inputs) < 255:
             own.inputs.append(recipe)
             return bytes([len(own.inputs)]) + ",".join(types).encode()
@@ -312,7 +371,9 @@ class Server:
             self._say("a recipe without variables sets up nothing")
         elif wire.NOT_FOUND in recipe.types:
             name = recipe.names[recipe.types.index(wire.NOT_FOUND)][:40]
-            self._say(f"{recipe.types.count(wire.NOT_FOUND)} variables are not served, the first is {name!r}")
+            self._say(
+                f"{recipe.types.count(wire.NOT_FOUND)} variables are not served, the first is {name!r}"
+            )
         return recipe
 
     def _receive(self, own: Client, body: bytes) -> None:
@@ -330,13 +391,19 @@ class Server:
     def _switch(self, values: dict[str, Any]) -> None:
         """Set outputs of the control box and the tool."""
         for name, shift in (("standard", 0), ("configurable", 8), ("tool", 16)):
-            mask, bits = (values.get(f"{name}_digital_output{end}", 0) << shift for end in ("_mask", ""))
-            self.state["actual_digital_output_bits"] = self.state["actual_digital_output_bits"] & ~mask | bits & mask
+            mask, bits = (
+                values.get(f"{name}_digital_output{end}", 0) << shift for end in ("_mask", "")
+            )
+            self.state["actual_digital_output_bits"] = (
+                self.state["actual_digital_output_bits"] & ~mask | bits & mask
+            )
         for k in (0, 1):
             if values.get("standard_analog_output_mask", 0) >> k & 1:
                 share = values.get(f"standard_analog_output_{k}", 0.0)
                 volts = values.get("standard_analog_output_type", 0) >> k & 1
-                self.state[f"standard_analog_output{k}"] = 10.0 * share if volts else 0.004 + 0.016 * share
+                self.state[f"standard_analog_output{k}"] = (
+                    10.0 * share if volts else 0.004 + 0.016 * share
+                )
         if values.get("speed_slider_mask", 0):
             self._say("setSpeedSlider is not served; speeds stay as commanded")
 
@@ -352,7 +419,9 @@ class Server:
             if len(script) > SCRIPT_SIZE:
                 raise wire.WireError(f"a script must be at most {SCRIPT_SIZE} bytes")
         if script:
-            raise wire.WireError(f"{len(script)} bytes that are no control script are not carried out")
+            raise wire.WireError(
+                f"{len(script)} bytes that are no control script are not carried out"
+            )
 
     def _load(self, script: bytes) -> None:
         """Begin the control program of a script, or raise a `WireError` for bytes that are none."""

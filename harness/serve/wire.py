@@ -19,15 +19,17 @@ from importlib.resources import files
 from itertools import islice
 from typing import Any, Final, Self
 
-CONTROLLER: Final = tomllib.loads(files(__package__).joinpath("controller.toml").read_text(encoding="utf-8"))
+CONTROLLER: Final = tomllib.loads(
+    files(__package__).joinpath("controller.toml").read_text(encoding="utf-8")
+)
 MAX_NAMES: Final = 2048  # bytes of a list of names, by the guide
-MAX_PACKET: Final = 3 + 8 + MAX_NAMES  # bytes of a packet of a client: a list of names with its frequency
+# Bytes of a packet of a client: a list of names with its frequency
+MAX_PACKET: Final = 3 + 8 + MAX_NAMES
 SIZES: Final = {"V": 5, "v": 3, "S": 3, "P": 3}  # bytes of the packets that have one size only
 KINDS: Final = {*SIZES, "O", "I", "U", "M"}  # those that a client sends
 MAX_LINE: Final = 4096  # bytes
-FOREIGN: Final = re.compile(
-    rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]"
-)  # HTTP, or bytes that are no text
+# HTTP, or bytes that are no text
+FOREIGN: Final = re.compile(rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]")
 NOT_FOUND: Final = "NOT_FOUND"
 CODES: Final = CONTROLLER["codes"]  # type -> layout of struct
 ZEROS: Final = {kind: (0,) * int(code[:-1] or 1) for kind, code in CODES.items()}
@@ -36,8 +38,12 @@ REGISTERS: Final = {"int": "INT32", "double": "DOUBLE"}
 
 def _types(way: str) -> dict[str, str]:
     """Return the type of each variable that travels one way, `input` or `output`."""
-    registers = {f"{way}_{word}_register_{k}": kind for word, kind in REGISTERS.items() for k in range(48)}
-    return {name: kind for kind, names in CONTROLLER[f"{way}s"].items() for name in names.split()} | registers
+    registers = {
+        f"{way}_{word}_register_{k}": kind for word, kind in REGISTERS.items() for k in range(48)
+    }
+    return {
+        name: kind for kind, names in CONTROLLER[f"{way}s"].items() for name in names.split()
+    } | registers
 
 
 OUTPUTS: Final = _types("output")
@@ -68,7 +74,9 @@ class Recipe:
         """
         names = tuple(name for name in body.decode("ascii", "replace").split(",") if name)
         if len(body) > MAX_NAMES or not body.isascii():
-            raise WireError(f"a recipe must be at most {MAX_NAMES} bytes of names, got {len(body)}, {body[:20]!r}")
+            raise WireError(
+                f"a recipe must be at most {MAX_NAMES} bytes of names, got {len(body)}, {body[:20]!r}"
+            )
         names = names or ("",)
         return cls(names, tuple(known.get(name, NOT_FOUND) for name in names))
 
@@ -88,10 +96,15 @@ class Recipe:
     def unpack(self, body: bytes) -> dict[str, Any]:
         """Return the value of each variable, or raise a `WireError` for another number of bytes."""
         if len(body) != self.layout.size:
-            raise WireError(f"data of {self.names[0]} … must be {self.layout.size} bytes, got {len(body)}")
+            raise WireError(
+                f"data of {self.names[0]} … must be {self.layout.size} bytes, got {len(body)}"
+            )
         numbers, sizes = iter(self.layout.unpack(body)), (len(ZEROS[kind]) for kind in self.types)
         taken = (tuple(islice(numbers, size)) for size in sizes)
-        return {name: each if len(each) > 1 else each[0] for name, each in zip(self.names, taken, strict=True)}
+        return {
+            name: each if len(each) > 1 else each[0]
+            for name, each in zip(self.names, taken, strict=True)
+        }
 
 
 def packet(kind: str, body: bytes) -> bytes:
@@ -113,18 +126,24 @@ async def read_packet(reader: asyncio.StreamReader) -> tuple[str, bytes] | None:
     except asyncio.IncompleteReadError as error:
         if not error.partial and error.expected == 3:
             return None
-        raise WireError(f"the stream ends within a packet, after {len(error.partial)} bytes") from None
+        raise WireError(
+            f"the stream ends within a packet, after {len(error.partial)} bytes"
+        ) from None
 
 
 def check_head(kind: str, size: int) -> None:
     """Raise a `WireError` where no client sends a packet of this kind and size."""
     if not 3 <= size <= MAX_PACKET:
         start = size.to_bytes(2)
-        raise WireError(f"a packet must have 3 to {MAX_PACKET} bytes, got a size of {size} ({start!r})")
+        raise WireError(
+            f"a packet must have 3 to {MAX_PACKET} bytes, got a size of {size} ({start!r})"
+        )
     if kind not in KINDS:
         raise WireError(f"kind {kind!r} of packet is none that a client sends")
     if size != SIZES.get(kind, size):
-        raise WireError(f"a packet of kind {kind!r} must have {SIZES[kind]} bytes, got a size of {size}")
+        raise WireError(
+            f"a packet of kind {kind!r} must have {SIZES[kind]} bytes, got a size of {size}"
+        )
 
 
 def read_message(body: bytes, version: int) -> str:

@@ -98,7 +98,11 @@ class Challenge:
     grade: Grade = nested(Grade)
 
     def cells(
-        self, plants: Sequence[str], controllers: Sequence[str], seeds: Sequence[int], bounded: int | None = None
+        self,
+        plants: Sequence[str],
+        controllers: Sequence[str],
+        seeds: Sequence[int],
+        bounded: int | None = None,
     ) -> list[Cell]:
         """Return the runs of methods and references.
 
@@ -108,13 +112,25 @@ class Challenge:
             seeds: of the robots.
             bounded: number of robots on which the references run; None for that of the file.
         """
-        short = {name: getattr(self, name) for name in SHORT_NAMES if getattr(self, name) is not None}
+        short = {
+            name: getattr(self, name) for name in SHORT_NAMES if getattr(self, name) is not None
+        }
         varied = tuple((short | flatten(self.settings)).items())
         methods = tuple(name for name in controllers if name not in self.reference)
         robots = {methods: seeds, self.reference: seeds[: bounded or self.reference_seeds]}
         arm = with_camera(DEFAULT_ROBOT, Path(self.camera)) if self.camera else DEFAULT_ROBOT
-        world = partial(Batch, tuple(plants) or self.plants, tasks=(self.task,), mismatches=(self.mismatch,), robot=arm)
-        requests = (request for names, own in robots.items() for request in world(names, seeds=own).requests())
+        world = partial(
+            Batch,
+            tuple(plants) or self.plants,
+            tasks=(self.task,),
+            mismatches=(self.mismatch,),
+            robot=arm,
+        )
+        requests = (
+            request
+            for names, own in robots.items()
+            for request in world(names, seeds=own).requests()
+        )
         return [Cell(replace(request, varied=varied)) for request in requests]
 
     def check(self) -> None:
@@ -128,19 +144,31 @@ class Challenge:
                 raise ValueError(f"{key} is missing")
         for name in self.reference:
             if not find_controller(name).needs_truth:
-                raise ValueError(f"reference {name} does not know the true robot; wanted calibrated, nmpc_calibrated")
+                raise ValueError(
+                    f"reference {name} does not know the true robot; wanted calibrated, nmpc_calibrated"
+                )
         for key in flatten(self.settings):
             if not key.startswith(OWN_SECTIONS):
-                raise ValueError(f"settings: {key} must begin with one of {', '.join(OWN_SECTIONS)}")
+                raise ValueError(
+                    f"settings: {key} must begin with one of {', '.join(OWN_SECTIONS)}"
+                )
         run = resolve(self.cells((), (), [0])[0].request, Settings())
         own_robot = find_plant(run.request.plant).own_robot
-        if self.measure == "settling" and not own_robot and draw(run).scenario.kind != "point_to_point":
-            raise ValueError(f"measure settling is for moves, and {self.task} is a curve; wanted path")
+        if (
+            self.measure == "settling"
+            and not own_robot
+            and draw(run).scenario.kind != "point_to_point"
+        ):
+            raise ValueError(
+                f"measure settling is for moves, and {self.task} is a curve; wanted path"
+            )
 
 
 def challenge_names() -> list[str]:
     """Return the names of the challenges of this package."""
-    return sorted(file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX))
+    return sorted(
+        file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX)
+    )
 
 
 def choose_challenges(words: Sequence[str], grades: Sequence[str]) -> list[Challenge]:
@@ -155,11 +183,15 @@ def choose_challenges(words: Sequence[str], grades: Sequence[str]) -> list[Chall
     found = [find_challenge(word) for word in words]
     names = [each.name for each in found]
     if again := [name for name in names if names.count(name) > 1]:
-        raise ConfigurationError(f"two challenges are called {again[0]}; give one of the files another name")
+        raise ConfigurationError(
+            f"two challenges are called {again[0]}; give one of the files another name"
+        )
     found.sort(key=lambda each: each.grade.name or "ungraded")
     chosen = [each for each in found if not grades or each.grade.name in grades]
     if not chosen:
-        raise ConfigurationError(f"none of these challenges is of grade {' or '.join(grades)}: {', '.join(names)}")
+        raise ConfigurationError(
+            f"none of these challenges is of grade {' or '.join(grades)}: {', '.join(names)}"
+        )
     return chosen
 
 
@@ -171,7 +203,9 @@ def find_challenge(word: str) -> Challenge:
     """
     is_own = word.lower().endswith(SUFFIX)
     if not is_own and word not in challenge_names():
-        raise ConfigurationError(f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file")
+        raise ConfigurationError(
+            f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file"
+        )
     path = user_path(word) if is_own else Path(str(FOLDER / f"{word}{SUFFIX}"))
     values = read_toml("challenge", path)
     with configuration_errors(f"{path}: "):

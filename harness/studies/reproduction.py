@@ -21,7 +21,14 @@ from servobench.harness.batch.plan import MAX_SEEDS
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import figure_style, method_styles, save_figure
-from servobench.harness.studies.claims import MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
+from servobench.harness.studies.claims import (
+    MAIN,
+    UNDECIDED,
+    Answer,
+    Measurement,
+    answer_all,
+    studies,
+)
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_text, write_atomically
 
@@ -33,11 +40,17 @@ ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
 NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
 RELATIVE, ABSOLUTE = 0.1, 0.051  # tolerances of the numbers in the evidence: a tenth and a period
-Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]  # claim, plant, division -> verdict, evidence
+# Claim, plant, division -> verdict, evidence
+Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]
 
 
 def reproduce(
-    out: Path, plants: Sequence[str], robots: int, how: Execution, divisions: Sequence[str], mismatch: str
+    out: Path,
+    plants: Sequence[str],
+    robots: int,
+    how: Execution,
+    divisions: Sequence[str],
+    mismatch: str,
 ) -> list[Answer]:
     """Carry out the runs and answer the claims.
 
@@ -59,20 +72,27 @@ def reproduce(
         wanted = f"at least {MIN_ROBOTS} to tell methods apart, and at most {MAX_SEEDS:,}"
         raise ConfigurationError(f"--seeds must be {wanted}, got {robots}")
     if any(find_plant(name).own_robot for name in plants):
-        raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
+        raise ConfigurationError(
+            "the claims are about a UR5; --plants names a plant with a robot of its own"
+        )
     made = {division: studies(plants, robots, division, mismatch) for division in divisions}
     answers, main = [], {}
     with locked(out):
         for division, parts in made.items():
             folder = out / division.replace(" ", "_")
             tables = carry_out_parts(parts, folder, how)
-            answers += [answer for plant in plants for answer in answer_all(tables, plant, division)]
+            answers += [
+                answer for plant in plants for answer in answer_all(tables, plant, division)
+            ]
             main[division] = tables[MAIN]
             manifest = results.read_manifest(folder / MAIN)
         answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
         results.write_summary(out, main, manifest)
         write_tables(answers, out)
-        write_atomically(out / "answers.md", partial(Path.write_text, data=markdown_table(answers), encoding="utf-8"))
+        write_atomically(
+            out / "answers.md",
+            partial(Path.write_text, data=markdown_table(answers), encoding="utf-8"),
+        )
         draw_answers(answers, out / FIGURES)
     return answers
 
@@ -106,17 +126,23 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
     places = list(dict.fromkeys(m.place for m in measured))
     labels = list(dict.fromkeys(m.label for m in measured))
     known = {(m.label, m.place): m.estimate for m in measured}
-    values = {label: [known.get((label, place), NO_ESTIMATE) for place in places] for label in labels}
+    values = {
+        label: [known.get((label, place), NO_ESTIMATE) for place in places] for label in labels
+    }
     draw_places(axes, range(len(places)), values, method_styles(labels))
     axes.set_xticks(range(len(places)), places)
     axes.set_xlim(-0.6, len(places) - 0.4)
-    if "−" in measured[0].panel or " over " in measured[0].panel:  # a difference or a ratio: a line at "alike"
+    if (
+        "−" in measured[0].panel or " over " in measured[0].panel
+    ):  # a difference or a ratio: a line at "alike"
         axes.axhline(0.0 if "−" in measured[0].panel else 1.0, color="black", linewidth=0.8)
     else:
         ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
         axes.set_ylim(0.0, 1.15 * max(1e-9, float(np.max(ends[np.isfinite(ends)], initial=0.0))))
     axes.grid(visible=True, alpha=0.3)
-    if axes.get_legend_handles_labels()[0]:  # none where no run gives a number, as moves too short to settle
+    if axes.get_legend_handles_labels()[
+        0
+    ]:  # none where no run gives a number, as moves too short to settle
         axes.legend(fontsize=7, frameon=False)
 
 
@@ -142,13 +168,23 @@ def read_answers(path: Path) -> Answers:
     Raises:
         ConfigurationError: the file is not a table of answers.
     """
-    text, columns = read_text("table of answers", path), ["claim", "plant", "division", "verdict", "evidence"]
+    text, columns = (
+        read_text("table of answers", path),
+        ["claim", "plant", "division", "verdict", "evidence"],
+    )
     try:
-        table = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False, comment="#", usecols=columns)
+        table = pd.read_csv(
+            io.StringIO(text), dtype=str, keep_default_na=False, comment="#", usecols=columns
+        )
     except ValueError as error:
         wanted = f"with the columns {', '.join(columns)}, such as {ANSWERS} of a folder of claims"
-        raise ConfigurationError(f"{path} is not a table of answers: wanted one {wanted}") from error
-    return {tuple(key): (verdict, evidence) for *key, verdict, evidence in table[columns].itertuples(index=False)}
+        raise ConfigurationError(
+            f"{path} is not a table of answers: wanted one {wanted}"
+        ) from error
+    return {
+        tuple(key): (verdict, evidence)
+        for *key, verdict, evidence in table[columns].itertuples(index=False)
+    }
 
 
 def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
@@ -188,7 +224,18 @@ def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
 
     In how many comparisons a claim holds is not compared, nor a verdict for which robots were too few.
     """
-    same = [other for other in answers if (other.claim, other.division) == (answer.claim, answer.division)]
-    verdicts, own = {other.plant: other.verdict.partition(":")[0] for other in same}, answer.verdict.partition(":")[0]
-    others = [plant for plant, verdict in verdicts.items() if verdict != own and UNDECIDED not in (verdict, own)]
+    same = [
+        other
+        for other in answers
+        if (other.claim, other.division) == (answer.claim, answer.division)
+    ]
+    verdicts, own = (
+        {other.plant: other.verdict.partition(":")[0] for other in same},
+        answer.verdict.partition(":")[0],
+    )
+    others = [
+        plant
+        for plant, verdict in verdicts.items()
+        if verdict != own and UNDECIDED not in (verdict, own)
+    ]
     return f" (otherwise on {', '.join(others)})" if others else ""

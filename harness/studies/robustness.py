@@ -26,7 +26,13 @@ from servobench.harness.config.registry import RENDERED, find_controller, find_p
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures import style
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied, find_robot
+from servobench.harness.run.request import (
+    DEFAULT_ROBOT,
+    RunRequest,
+    RunSettings,
+    Varied,
+    find_robot,
+)
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
@@ -57,12 +63,22 @@ class Line:
 
 
 LINES: Final = (
-    Line("camera_rotation", "camera turned [°]", parse_magnitudes("camera_rotation", "0:180:30deg")),
+    Line(
+        "camera_rotation", "camera turned [°]", parse_magnitudes("camera_rotation", "0:180:30deg")
+    ),
     Line("links", "link lengths wrong by up to [%]", parse_magnitudes("links", "0:30:10%")),
-    Line("joint_offsets", "joint zeros wrong by up to [°]", parse_magnitudes("joint_offsets", "0:20:5deg")),
+    Line(
+        "joint_offsets",
+        "joint zeros wrong by up to [°]",
+        parse_magnitudes("joint_offsets", "0:20:5deg"),
+    ),
     Line("tool", "tool wrong by up to [mm]", parse_magnitudes("tool", "0:100:25mm")),
     Line(LATENCY, "camera latency [ms]", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
-    Line(NOISE, "sensor noise [times the usual]", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
+    Line(
+        NOISE,
+        "sensor noise [times the usual]",
+        tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8)),
+    ),
     Line(MOVE, "camera moved half-way [°]", parse_magnitudes(MOVE, "0:180:45deg")),
 )
 SENSOR_LINES: Final = (
@@ -72,11 +88,19 @@ SENSOR_LINES: Final = (
     Line("uniform", "uniform noise, deviation [mm]", parse_magnitudes("uniform", "0/1/2/4/8mm")),
     Line("quantised", "feature rounded to [mm]", parse_magnitudes("quantised", "0/1/2/5/10mm")),
     Line("outliers", "frames that are outliers [%]", parse_magnitudes("outliers", "0:40:10%")),
-    Line("occlusions", "frames with the feature hidden [%]", parse_magnitudes("occlusions", "0:40:10%")),
+    Line(
+        "occlusions",
+        "frames with the feature hidden [%]",
+        parse_magnitudes("occlusions", "0:40:10%"),
+    ),
     Line("lost_frames", "frames lost [%]", parse_magnitudes("lost_frames", "0:80:20%")),
-    Line("frame_period", "time between frames [ms]", parse_magnitudes("frame_period", "50:200:50ms")),
+    Line(
+        "frame_period", "time between frames [ms]", parse_magnitudes("frame_period", "50:200:50ms")
+    ),
     Line("jitter", "frames late by up to [ms]", parse_magnitudes("jitter", "0:200:50ms")),
-    Line("latency_swing", "latency swinging by [ms]", parse_magnitudes("latency_swing", "0:200:50ms")),
+    Line(
+        "latency_swing", "latency swinging by [ms]", parse_magnitudes("latency_swing", "0:200:50ms")
+    ),
     Line("camera_turn", "camera turning by [°/s]", parse_magnitudes("camera_turn", "0:15:5deg")),
 )
 KNOWN_LINES: Final = {line.axis: line for line in (*LINES, *SENSOR_LINES)}
@@ -99,14 +123,28 @@ def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONG
 
     def cell(place: Place, request: RunRequest) -> Cell:
         number = 0.0 if place.magnitude is None else place.magnitude.number
-        known: dict[str, Varied] = {LATENCY: ((LATENCY, number / 1000.0),), NOISE: ((NOISE, number),), MOVE: moving}
-        mismatch = request.mismatch if place.axis in (LATENCY, NOISE) else place.vary(request.mismatch)
-        return Cell(replace(request, mismatch=mismatch, varied=known.get(place.axis, ())), place.columns)
+        known: dict[str, Varied] = {
+            LATENCY: ((LATENCY, number / 1000.0),),
+            NOISE: ((NOISE, number),),
+            MOVE: moving,
+        }
+        mismatch = (
+            request.mismatch if place.axis in (LATENCY, NOISE) else place.vary(request.mismatch)
+        )
+        return Cell(
+            replace(request, mismatch=mismatch, varied=known.get(place.axis, ())), place.columns
+        )
 
-    return Grid(cell, [Place(line.axis, magnitude) for line in lines for magnitude in line.places], batch.requests())
+    return Grid(
+        cell,
+        [Place(line.axis, magnitude) for line in lines for magnitude in line.places],
+        batch.requests(),
+    )
 
 
-def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines: Sequence[Line] = LINES) -> list[Path]:
+def make_map(
+    out: Path, batch: Batch, settings: Settings, how: Execution, lines: Sequence[Line] = LINES
+) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
     Args:
@@ -124,10 +162,17 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
     """
     (plant,) = batch.plants
     if find_plant(plant).own_robot:
-        raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")
-    moving = () if "duration" in settings.sections.get(TASK, {}) else LONGER  # a duration that a user gives is kept
+        raise ConfigurationError(
+            f"the map varies the true robot, and plant {plant} brings one of its own"
+        )
+    # A duration that a user gives is kept
+    moving = () if "duration" in settings.sections.get(TASK, {}) else LONGER
     carry_out(Campaign(map_cells(batch, lines, moving), settings), out, how)
-    linear = batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED and find_robot(batch.robot).twin is None
+    linear = (
+        batch.sensings == (DEFAULT_SENSING,)
+        and plant not in RENDERED
+        and find_robot(batch.robot).twin is None
+    )
     drawn = linear and any(line.axis == LATENCY for line in lines)
     limits = predicted_limits(batch.controllers, settings, batch.robot, plant) if drawn else {}
     column = pd.Series(limits, name="predicted_latency_limit_s")
@@ -136,7 +181,10 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
 
 
 def predicted_limits(
-    controllers: Sequence[str], settings: Settings, robot: str = DEFAULT_ROBOT, plant: str = "kinematic"
+    controllers: Sequence[str],
+    settings: Settings,
+    robot: str = DEFAULT_ROBOT,
+    plant: str = "kinematic",
 ) -> dict[str, float]:
     """Return from which latency on the loop of each composed controller is predicted to be unstable, in s.
 
@@ -146,7 +194,10 @@ def predicted_limits(
     known = {field.name for field in fields(KinematicConfig)}
     own = {key: value for key, value in settings.sections.get(plant, {}).items() if key in known}
     latencies = [place.number / 1000.0 for place in KNOWN_LINES[LATENCY].places]
-    run, config = settings.resolve("run", RunSettings()), Settings({plant: own}).resolve(plant, KinematicConfig())
+    run, config = (
+        settings.resolve("run", RunSettings()),
+        Settings({plant: own}).resolve(plant, KinematicConfig()),
+    )
     limits = {}
     for name in controllers:
         entry = find_controller(name)
@@ -165,7 +216,9 @@ def map_runs(folder: Path) -> pd.DataFrame:
     runs, configuration = results.load_runs(folder), results.read_manifest(folder)["configuration"]
     durations = comparison.column_of(runs, DURATION).fillna(configuration[TASK]["duration"])
     moved = (runs["axis"] == MOVE) & (runs["magnitude"] > 0.0)
-    return runs.assign(moved_at_s=(configuration["run"]["camera_moves_at"] * durations).where(moved))
+    return runs.assign(
+        moved_at_s=(configuration["run"]["camera_moves_at"] * durations).where(moved)
+    )
 
 
 def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> list[Path]:
@@ -183,7 +236,9 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> l
     took = "Median settling time, from the move where the camera moves"
     share = _draw(runs, limits, comparison.settled_share, arrived, "settled runs [%]", 104.0)
     time = _draw(runs, limits, settling_median, took, "settling time [s]", 10.0)
-    return style.save_figure(share, folder / "robustness") + style.save_figure(time, folder / "robustness_settling")
+    return style.save_figure(share, folder / "robustness") + style.save_figure(
+        time, folder / "robustness_settling"
+    )
 
 
 def settling_median(runs: pd.DataFrame) -> comparison.Estimate:
@@ -196,7 +251,12 @@ def settling_median(runs: pd.DataFrame) -> comparison.Estimate:
 
 
 def _draw(
-    runs: pd.DataFrame, limits: Mapping[str, float], measure: Measure, title: str, label: str, top: float
+    runs: pd.DataFrame,
+    limits: Mapping[str, float],
+    measure: Measure,
+    title: str,
+    label: str,
+    top: float,
 ) -> Figure:
     """Draw a measure of the runs at each place of the map, with a title, its label and the upper edge of the panels."""
     controllers = list(dict.fromkeys(runs["controller"]))
@@ -206,26 +266,44 @@ def _draw(
         if axis in set(runs["axis"]):
             cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))
             numbers = [place.number for place in line.places]
-            curves[axis] = {name: [measure(cells[name, each]) for each in numbers] for name in controllers}
-    alike = [axis for axis, each in curves.items() if len(same_curves(each)) == 1]  # all methods, and at all places:
-    flat = [axis for axis in alike if len({e.value for each in curves[axis].values() for e in each}) == 1]
+            curves[axis] = {
+                name: [measure(cells[name, each]) for each in numbers] for name in controllers
+            }
+    # All methods, and at all places:
+    alike = [axis for axis, each in curves.items() if len(same_curves(each)) == 1]
+    flat = [
+        axis
+        for axis in alike
+        if len({e.value for each in curves[axis].values() for e in each}) == 1
+    ]
     lines = [KNOWN_LINES[axis] for axis in curves if axis not in flat or len(flat) == len(curves)]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     with style.figure_style(style.TEXT):
         figure, panels = style.panel_grid(len(lines), 1.9, head=1.5)
         for axes, line in zip(panels, lines, strict=True):
-            draw_curves(axes, [place.number for place in line.places], curves[line.axis], styles, top)
+            draw_curves(
+                axes, [place.number for place in line.places], curves[line.axis], styles, top
+            )
             axes.set_xticks([place.number for place in line.places])
             axes.set_xlabel(line.title)
             if line.axis == LATENCY and limits:
                 _mark_limits(axes, line, limits, styles)
         style.label_rows(panels, label)
         arm = runs["robot"].iloc[0]
-        which = f"robots a point on {plant}" if arm == DEFAULT_ROBOT else f"{Path(arm).stem} a point on {plant}"
+        which = (
+            f"robots a point on {plant}"
+            if arm == DEFAULT_ROBOT
+            else f"{Path(arm).stem} a point on {plant}"
+        )
         notes = [f"{robots} {which}, bands are 95 % intervals"]
         if 0 < len(flat) < len(curves):
             notes.append(_name_flat(flat, curves))
-        if any(np.isinf(e.value) for axis in curves.values() for estimates in axis.values() for e in estimates):
+        if any(
+            np.isinf(e.value)
+            for axis in curves.values()
+            for estimates in axis.values()
+            for e in estimates
+        ):
             notes.append("carets at the upper edge: half of the runs or more never settle")
         words = "\n".join(textwrap.fill(note, NOTE) for note in notes)
         figure.suptitle(f"{title}\n{words}", fontsize=style.TEXT + 0.5)
@@ -237,16 +315,24 @@ def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
     """Return a sentence on the axes along which nothing differs."""
     found = next(iter(curves[flat[0]].values()))[0]
     lines = [KNOWN_LINES[axis] for axis in flat]
-    words = "; ".join(re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title) for line in lines)
+    words = "; ".join(
+        re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title) for line in lines
+    )
     return f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: {words}"
 
 
 def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: style.Styles) -> None:
     """Draw a vertical line where each method is predicted to become unstable, if that is on the axis."""
     last = line.places[-1].number
-    drawn = {name: 1000.0 * limit for name, limit in limits.items() if name in styles and 1000.0 * limit <= last}
+    drawn = {
+        name: 1000.0 * limit
+        for name, limit in limits.items()
+        if name in styles and 1000.0 * limit <= last
+    }
     for name, limit in drawn.items():
-        axes.axvline(limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6)
+        axes.axvline(
+            limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6
+        )
     beyond = ", others beyond" * (len(drawn) < len(limits))
     words = f"upright: predicted limit of stability of {', '.join(drawn)}{beyond}"
     axes.set_xlabel(f"{line.title}\n{textwrap.fill(words, NOTE // 3)}" if drawn else line.title)

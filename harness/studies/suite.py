@@ -17,7 +17,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import column_of, median_with_interval, outcomes, success_rate
+from servobench.harness.analysis.comparison import (
+    column_of,
+    median_with_interval,
+    outcomes,
+    success_rate,
+)
 from servobench.harness.analysis.scores import profile, ranking, resolution, scores
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
@@ -39,7 +44,11 @@ DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())
 
 
 def carry_out_suite(
-    out: Path, challenges: Sequence[Challenge], runs: Mapping[str, Sequence[Run]], settings: Settings, how: Execution
+    out: Path,
+    challenges: Sequence[Challenge],
+    runs: Mapping[str, Sequence[Run]],
+    settings: Settings,
+    how: Execution,
 ) -> pd.DataFrame:
     """Carry out the runs of challenges, judge them, write tables and pictures, and return the judged runs.
 
@@ -54,7 +63,9 @@ def carry_out_suite(
         ConfigurationError: settings that nothing reads or that a challenge fixes, or as `carry_out_parts`.
     """
     requests = [run.request for own in runs.values() for run in own]
-    check_settings(settings, [name for each in requests for name in (each.plant, each.controller, each.task)])
+    check_settings(
+        settings, [name for each in requests for name in (each.plant, each.controller, each.task)]
+    )
     for cells in runs.values():
         check_effects(settings, [cell.request for cell in cells], steps=False)
     seeing = {SEEING: {"image": True, **settings.sections.get(SEEING, {})}}
@@ -63,7 +74,9 @@ def carry_out_suite(
     for request in requests:
         select(request, sections)  # all challenges are checked before the first one runs
     tables = carry_out_parts({name: Campaign(own, whole) for name, own in runs.items()}, out, how)
-    judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)
+    judged = pd.concat(
+        [judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True
+    )
     write_csv(judged, out / RUNS)
     for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):
         write_csv(pd.json_normalize(as_plain(rows)), out / name)
@@ -98,10 +111,13 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
 def bounded(judged: pd.DataFrame) -> pd.DataFrame:
     """Return the scored runs of challenges whose references lose few robots, of methods that were in all of them."""
     known = judged[judged["score"].notna()]
-    lost = known.groupby(["challenge", "plant"])["reference"].transform(lambda own: own.isna().mean())
+    lost = known.groupby(["challenge", "plant"])["reference"].transform(
+        lambda own: own.isna().mean()
+    )
     kept = known[lost <= MAX_REFERENCE_LOSS]
     count = kept.groupby(["plant", "controller"])["seed"].transform("size")
-    return kept[count == count.groupby(kept["plant"]).transform("max")]  # a reference may be in some of them only
+    # A reference may be in some of them only
+    return kept[count == count.groupby(kept["plant"]).transform("max")]
 
 
 def methods_rows(judged: pd.DataFrame) -> list[Row]:
@@ -109,10 +125,17 @@ def methods_rows(judged: pd.DataFrame) -> list[Row]:
     rows = []
     for _, place in judged.groupby(["challenge", "plant"], sort=False):
         best = place[place["score"].notna()].drop_duplicates("seed")["reference"]
-        about = {name: Cell(str(place[name].iloc[0])) for name in ("challenge", "grade", "plant", "measure")}
+        about = {
+            name: Cell(str(place[name].iloc[0]))
+            for name in ("challenge", "grade", "plant", "measure")
+        }
         about["reference"] = Cell(median_with_interval(best).value, ".2f")
         about["reference_lost"] = Cell(100.0 * float(best.isna().mean()), ".1f")
-        means = place.groupby("controller", sort=False)["score"].mean().sort_values(ascending=False, kind="stable")
+        means = (
+            place.groupby("controller", sort=False)["score"]
+            .mean()
+            .sort_values(ascending=False, kind="stable")
+        )
         for name, score in means.items():
             own = place[place["controller"] == name]
             good = success_rate(int(own["value"].notna().sum()), len(own)).scaled(100.0)
@@ -130,10 +153,16 @@ def ranking_rows(judged: pd.DataFrame) -> list[Row]:
     for plant, own in bounded(judged).groupby("plant", sort=False):
         shares = profile(own, FACTORS)
         for each in ranking(own):
-            row = {"plant": Cell(str(plant)), "controller": Cell(each.controller), "rank": Cell(each.rank)}
+            row = {
+                "plant": Cell(str(plant)),
+                "controller": Cell(each.controller),
+                "rank": Cell(each.rank),
+            }
             row |= {"score": Cell(each.score, ".2f"), "lost, %": Cell(100.0 * each.lost, ".1f")}
             within = zip(FACTORS, shares[each.controller], strict=True)
-            rows.append(row | {f"within {factor:g}×": Cell(float(share), ".2f") for factor, share in within})
+            rows.append(
+                row | {f"within {factor:g}×": Cell(float(share), ".2f") for factor, share in within}
+            )
     return rows
 
 
@@ -143,13 +172,18 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     rows = as_text(methods_rows(judged))
     for (name, plant), place in rows.groupby(["challenge", "plant"], sort=False):
         about, measure = place.iloc[0], MEASURES[place["measure"].iloc[0]]
-        scored = judged[(judged["challenge"] == name) & (judged["plant"] == plant) & judged["score"].notna()]
+        scored = judged[
+            (judged["challenge"] == name) & (judged["plant"] == plant) & judged["score"].notna()
+        ]
         fails = len(scored) > 0 and bounded(scored).empty
         grade = "no grade, as its references fail" if fails else about["grade"] or "ungraded"
         bound = f"reference {about['reference']} {measure.unit}, lost {about['reference_lost']} %"
         heads = {"controller": "controller", "runs": "runs", "good": f"{measure.achieved}, %",
                  "median": f"median, {measure.unit}", "lost": "lost, %", "score": "score"}  # fmt: skip
-        yield f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}", place[list(heads)].rename(columns=heads)
+        yield (
+            f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}",
+            place[list(heads)].rename(columns=heads),
+        )
     if ranks := ranking_rows(judged):
         for plant, place in as_text(ranks).groupby("plant", sort=False):
             own = bounded(judged[judged["plant"] == plant])
@@ -175,18 +209,25 @@ def draw_suite(runs: pd.DataFrame, folder: Path) -> list[Path]:
         figure = Figure(figsize=(style.WIDTH, sum(heights) + 0.9), layout="constrained")
         top, bottom = figure.subplots(2, 1, height_ratios=heights)
         for name in means.index:
-            top.plot(shares.index, shares[name], label=name, **styles[name].line_arguments(len(shares)))
+            top.plot(
+                shares.index, shares[name], label=name, **styles[name].line_arguments(len(shares))
+            )
         style.plain_logarithms(top, "x")
         top.set(xlabel="times the best method of the run", ylabel="share of runs", ylim=(0.0, 1.02))
-        top.set_title(f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}")
+        top.set_title(
+            f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}"
+        )
         _draw_scores(bottom, means)
         style.add_legend(figure, [top])
-    return style.save_figure(figure, folder / UNFIT_FOR_FILES.sub("_", f"{PICTURE}_{runs['plant'].iloc[0]}"))
+    return style.save_figure(
+        figure, folder / UNFIT_FOR_FILES.sub("_", f"{PICTURE}_{runs['plant'].iloc[0]}")
+    )
 
 
 def _draw_scores(axes: Axes, means: pd.DataFrame) -> None:
     """Draw a cell for each method and challenge; dark is good."""
-    axes.imshow(means, cmap="Blues", vmin=0.0, vmax=1.3, aspect="auto")  # so that text is readable on every cell
+    # So that text is readable on every cell
+    axes.imshow(means, cmap="Blues", vmin=0.0, vmax=1.3, aspect="auto")
     for (row, column), score in np.ndenumerate(means.to_numpy()):
         axes.text(column, row, f"{score:.2f}", ha="center", va="center", fontsize=style.TEXT - 2.0)
     axes.set_xticks(range(means.shape[1]), means.columns, rotation=40.0, ha="right")

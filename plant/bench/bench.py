@@ -32,7 +32,13 @@ from servobench.plant.contract.lanes import take
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
-from servobench.plant.contract.signals import BoolArray, Command, Observation, Truth, trusted_observation
+from servobench.plant.contract.signals import (
+    BoolArray,
+    Command,
+    Observation,
+    Truth,
+    trusted_observation,
+)
 from servobench.plant.robot.mechanics import RippledJacobian
 
 MAX_STEP: Final = 1e-3  # [s] longest sub-step to which times are rounded
@@ -44,9 +50,13 @@ class Timing:
     """Times of the bench in sub-steps of length h; sub-step i ends at the time i h."""
 
     steps: int  # in a control period, N
-    delays: tuple[int, ...]  # [periods] age of the command that acts in each of the N sub-steps of a period
+    delays: tuple[
+        int, ...
+    ]  # [periods] age of the command that acts in each of the N sub-steps of a period
     latency: int  # between exposure and delivery of a frame
-    frames: float  # between two exposures; a fraction where frames take no whole number of sub-steps
+    frames: (
+        float  # between two exposures; a fraction where frames take no whole number of sub-steps
+    )
     phase: int  # exposures happen after the sub-steps nearest to `phase` + j `frames`, j whole
 
     @classmethod
@@ -64,9 +74,13 @@ class Timing:
         """
         times = {"period": period, **delays_of(command_delay, sensing)}
         for name, value in times.items():
-            fits = _is_multiple(value, step) or (name == "frame_period" and step < MAX_STEP + TIME_TOLERANCE)
+            fits = _is_multiple(value, step) or (
+                name == "frame_period" and step < MAX_STEP + TIME_TOLERANCE
+            )
             if not fits:
-                raise ValueError(f"{name} must be a multiple of the world's period of {step:g} s, got {value:g} s")
+                raise ValueError(
+                    f"{name} must be a multiple of the world's period of {step:g} s, got {value:g} s"
+                )
         steps, delay, latency, whole = (round(value / step) for value in times.values())
         delays = tuple(max(0, -((j - delay) // steps)) for j in range(steps))
         if sensing.frame_period == 0.0:
@@ -83,7 +97,11 @@ class Timing:
 
 def delays_of(command_delay: float, sensing: SensingConfig) -> dict[str, float]:
     """Return the times [s] that a bench adds to a world, by the name of the setting."""
-    return {"command_delay": command_delay, "latency": sensing.latency, "frame_period": sensing.frame_period}
+    return {
+        "command_delay": command_delay,
+        "latency": sensing.latency,
+        "frame_period": sensing.frame_period,
+    }
 
 
 def common_step(period: float, command_delay: float, sensing: SensingConfig) -> float:
@@ -109,7 +127,9 @@ def common_step(period: float, command_delay: float, sensing: SensingConfig) -> 
     return period / fewest
 
 
-def rounded_to(step: float, period: float, command_delay: float, sensing: SensingConfig) -> tuple[float, SensingConfig]:
+def rounded_to(
+    step: float, period: float, command_delay: float, sensing: SensingConfig
+) -> tuple[float, SensingConfig]:
     """Return command delay and sensing with times that are multiples of a sub-step; remark on those that change.
 
     A frame period that is no multiple of it stays, as frames are exposed after the nearest sub-steps.
@@ -136,7 +156,9 @@ def _is_multiple(value: float, step: float, tolerance: float = TIME_TOLERANCE) -
 class Frame(NamedTuple):
     """A frame on its way to the controller."""
 
-    due: int | FloatArray  # number of the sub-step after which it is delivered; with jitter, (...) and no whole number
+    due: (
+        int | FloatArray
+    )  # number of the sub-step after which it is delivered; with jitter, (...) and no whole number
     feature: FloatArray  # (..., m)
     valid: BoolArray  # (..., m), which features are measured and will arrive
 
@@ -150,7 +172,9 @@ class BenchState:
     frames: tuple[Frame, ...]  # frames under way, oldest first
     held: FloatArray  # (..., m), the last valid feature
     sensor: Sensor  # its random streams, and the outliers and occlusions that last
-    camera: FloatArray | None  # (..., 4, 4), pose at the start of a camera that turns; None of others
+    camera: (
+        FloatArray | None
+    )  # (..., 4, 4), pose at the start of a camera that turns; None of others
     world: Any  # the saved state of the world
 
 
@@ -193,7 +217,9 @@ class Bench(Plant):
         self._camera = self._first_camera = camera if sensing.camera_turn > 0.0 else None
         if sensing.camera_turn > 0.0:
             if camera is None:
-                raise ValueError("camera_turn needs a camera whose pose is known; leave it at 0 for this plant")
+                raise ValueError(
+                    "camera_turn needs a camera whose pose is known; leave it at 0 for this plant"
+                )
             world.move_camera(camera)  # refuses it where it cannot be moved
 
     def _size_masks(self) -> None:
@@ -217,7 +243,9 @@ class Bench(Plant):
         if np.shape(seed) != self.world.lead:
             raise ValueError(f"seed must have shape {self.world.lead}, got {np.shape(seed)}")
         interval = self._timing.frames * self._step
-        self._sensor = Sensor(self._sensing, self._extents, self.spec.m, interval, seed, self.world.lead)
+        self._sensor = Sensor(
+            self._sensing, self._extents, self.spec.m, interval, seed, self.world.lead
+        )
         joints = self.world.reset(seed)
         first = self._expose()
         if first is None:
@@ -230,7 +258,8 @@ class Bench(Plant):
         rest.setflags(write=False)
         self._commands = deque([rest] * self._timing.delays[0])
         latency = self._timing.latency
-        exposed = filter(self._timing.exposes, range(1 - latency, 1))  # before the start, and due after it
+        # Before the start, and due after it
+        exposed = filter(self._timing.exposes, range(1 - latency, 1))
         self._frames = deque(Frame(step + latency, first, self._all_valid) for step in exposed)
         self._held, self._k, self._camera = first, 0, self._first_camera
         return self._observation(joints, first, self._all_valid)
@@ -248,7 +277,9 @@ class Bench(Plant):
         timing = self._timing
         for i, delay in enumerate(timing.delays, self._k * timing.steps + 1):
             if self._camera is not None:
-                self.world.move_camera(turned_about_axis(self._camera, self._sensing.camera_turn * i * self._step))
+                self.world.move_camera(
+                    turned_about_axis(self._camera, self._sensing.camera_turn * i * self._step)
+                )
             joints = self.world.advance(self._commands[-1 - delay])
             if timing.exposes(i):
                 self._frames.append(self._sent(i))
@@ -273,13 +304,17 @@ class Bench(Plant):
         """Return the same as `_delivered` for lanes whose frames are due at different times."""
         feature, valid, before = self._held, self._none_valid, now - self._timing.steps
         for due, newer, own in self._frames:
-            fresh = np.logical_and(own, np.asarray(np.logical_and(before < due, due <= now))[..., None])
+            fresh = np.logical_and(
+                own, np.asarray(np.logical_and(before < due, due <= now))[..., None]
+            )
             feature, valid = np.where(fresh, newer, feature), np.logical_or(valid, fresh)
         while self._frames and np.all(self._frames[0].due <= now):
             self._frames.popleft()
         return feature, valid
 
-    def _observation(self, joints: FloatArray, feature: FloatArray, valid: BoolArray) -> Observation:
+    def _observation(
+        self, joints: FloatArray, feature: FloatArray, valid: BoolArray
+    ) -> Observation:
         """Return the observation of the present period; features that do not arrive are held."""
         time, whole = self._k * self._period, self._whole
         if valid is not self._all_valid:
@@ -304,7 +339,11 @@ class Bench(Plant):
 
     def _sent(self, step: int) -> Frame:
         """Return the frame that is exposed after a sub-step, with which of its features will arrive."""
-        feature, missing, valid = self._expose(), self._sensor.missing(step * self._step), self._all_valid
+        feature, missing, valid = (
+            self._expose(),
+            self._sensor.missing(step * self._step),
+            self._all_valid,
+        )
         if feature is None:
             feature, valid = self._held, self._none_valid
         if missing is not None:
@@ -333,7 +372,9 @@ class Bench(Plant):
             ValueError: a state of another number of runs side by side.
         """
         if state.held.shape != self._all_valid.shape:
-            raise ValueError(f"state must be of runs of shape {self.world.lead}, got {state.held.shape[:-1]}")
+            raise ValueError(
+                f"state must be of runs of shape {self.world.lead}, got {state.held.shape[:-1]}"
+            )
         self.world.restore(state.world)
         self._k, self._held, self._camera = state.period, state.held, state.camera
         self._commands, self._frames = deque(state.commands), deque(state.frames)
@@ -351,7 +392,9 @@ class Bench(Plant):
         self.world.keep(lanes)
         self._size_masks()
         self._sensor.keep(lanes)
-        commands, frames, self._held = take((tuple(self._commands), tuple(self._frames), self._held), lanes)
+        commands, frames, self._held = take(
+            (tuple(self._commands), tuple(self._frames), self._held), lanes
+        )
         self._commands, self._frames = deque(commands), deque(frames)
         if self._camera is not None and self._first_camera is not None:
             self._camera, self._first_camera = self._camera[lanes], self._first_camera[lanes]
@@ -366,7 +409,9 @@ class Bench(Plant):
         if mechanics.ripple > 0.0:
             a, k = mechanics.ripple, mechanics.ripple_order
             jacobian = RippledJacobian(model.jacobian, mechanics)
-            model = replace(model, jacobian=jacobian, symbolic=lambda q: symbolic(q + a * (k * q).sin()))
+            model = replace(
+                model, jacobian=jacobian, symbolic=lambda q: symbolic(q + a * (k * q).sin())
+            )
         return replace(
             model, latency=sensing.latency, command_delay=self._command_delay, lag=self.world.lag,
             latency_spread=sensing.jitter + 2.0 * sensing.latency_swing, camera_turn=sensing.camera_turn,
@@ -399,12 +444,18 @@ def turned_about_axis(pose: FloatArray, angle: float) -> FloatArray:
     """Return poses (..., 4, 4) turned about their own z axis by an angle [rad]."""
     c, s = math.cos(angle), math.sin(angle)
     turned = np.array(pose)
-    turned[..., 0], turned[..., 1] = c * pose[..., 0] + s * pose[..., 1], c * pose[..., 1] - s * pose[..., 0]
+    turned[..., 0], turned[..., 1] = (
+        c * pose[..., 0] + s * pose[..., 1],
+        c * pose[..., 1] - s * pose[..., 0],
+    )
     return turned
 
 
 def build_bench(
-    make: Callable[[PlantSetup], World], setup: PlantSetup, command_delay: float, sensing: SensingConfig
+    make: Callable[[PlantSetup], World],
+    setup: PlantSetup,
+    command_delay: float,
+    sensing: SensingConfig,
 ) -> Bench:
     """Return a bench around a world with the sub-steps that the delays need.
 
@@ -427,4 +478,10 @@ def build_bench(
         remedy = "run.period, command_delay and latency that are multiples of its own step help"
         raise ValueError(f"{found}; {remedy}") from error
     command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
-    return Bench(world, command_delay, sensing, setup.period, None if setup.model is None else setup.model.camera)
+    return Bench(
+        world,
+        command_delay,
+        sensing,
+        setup.period,
+        None if setup.model is None else setup.model.camera,
+    )

@@ -30,12 +30,16 @@ ImageArray: TypeAlias = npt.NDArray[np.uint8]
 class TrueModel:
     """The kinematics of the true robot and the delays of commands and features; for upper bounds only."""
 
-    jacobian: Callable[[FloatArray], FloatArray]  # (..., n) rad -> (..., m, n), unit of the feature per rad.
+    jacobian: Callable[
+        [FloatArray], FloatArray
+    ]  # (..., n) rad -> (..., m, n), unit of the feature per rad.
     # from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1)
     symbolic: Callable[[Any], Any]
     latency: float = 0.0  # between exposure and delivery of a frame, s
     command_delay: float = 0.0  # between a command and its first effect, s
-    lag: float | None = None  # time constant of the joints' velocity loops, s; None where it is unknown
+    lag: float | None = (
+        None  # time constant of the joints' velocity loops, s; None where it is unknown
+    )
     latency_spread: float = 0.0  # by which a frame may be later than the latency, s
     camera_turn: float = 0.0  # with which the first camera turns about its optical axis, rad/s
     # natural frequency [rad/s] and damping ratio of a flexible tool; frequency 0 for a rigid one
@@ -78,7 +82,9 @@ class Abilities(ABC):
         Raises:
             ValueError: the plant does not know them; says why.
         """
-        raise ValueError("this plant does not know the kinematics of its robot, which an upper bound needs")
+        raise ValueError(
+            "this plant does not know the kinematics of its robot, which an upper bound needs"
+        )
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """Return the kinematics of the plant's robot with the plant's own delays, as far as it knows them."""
@@ -104,7 +110,9 @@ class Abilities(ABC):
         Raises:
             ValueError: a plant without a camera that could be moved.
         """
-        wanted = "leave camera_move and camera_turn out, or define move_camera(self, X_BC) in its class"
+        wanted = (
+            "leave camera_move and camera_turn out, or define move_camera(self, X_BC) in its class"
+        )
         raise ValueError(f"the plant has no camera that could be moved; {wanted}")
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
@@ -186,7 +194,9 @@ class PlantSetup:
             ValueError: there are none, or a start of the wrong shape.
         """
         if self.model is None or self.start is None:
-            raise ValueError("the setup has no robot: a plant with own_robot = True brings its arm, start and limits")
+            raise ValueError(
+                "the setup has no robot: a plant with own_robot = True brings its arm, start and limits"
+            )
         return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
 
 

@@ -28,7 +28,13 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
-from servobench.plant.contract.sensing import Extents, SensingConfig, draw_directions, family_of, quantise
+from servobench.plant.contract.sensing import (
+    Extents,
+    SensingConfig,
+    draw_directions,
+    family_of,
+    quantise,
+)
 from servobench.plant.contract.signals import BoolArray
 
 TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
@@ -42,7 +48,13 @@ class Sensor:
     """
 
     def __init__(
-        self, config: SensingConfig, extents: Extents, m: int, interval: float, seed: Seeds, lead: tuple[int, ...]
+        self,
+        config: SensingConfig,
+        extents: Extents,
+        m: int,
+        interval: float,
+        seed: Seeds,
+        lead: tuple[int, ...],
     ) -> None:
         """Begin all streams.
 
@@ -63,15 +75,25 @@ class Sensor:
         stream: Callable[..., Stream] = partial(Stream, seed)
         self._shape = np.array(config.noise_shape)
         if config.noise_shape and self._shape.shape != (m, m):
-            raise ValueError(f"sensing.noise_shape needs {m} rows of {m} numbers, got {list(config.noise_shape)}")
+            raise ValueError(
+                f"sensing.noise_shape needs {m} rows of {m} numbers, got {list(config.noise_shape)}"
+            )
         self._noise = stream("feature_noise", family_of(config, extents), (m,), self._scale)
         share = np.random.Generator.random
         self._losses, self._lateness = stream("dropped_frames", share), stream("late_frames", share)
-        self._outlier_begins, self._occlusion_begins = stream("outliers", share), stream("occlusions", share)
+        self._outlier_begins, self._occlusion_begins = (
+            stream("outliers", share),
+            stream("occlusions", share),
+        )
         self._outlier_values = stream("outlier_values", draw_directions, (m,), extents.outlier_size)
         durations = config.outlier_duration, config.occlusion_duration
-        self._outlier_frames, self._occlusion_frames = (max(1, round(each / interval)) for each in durations)
-        self._outlier, self._occlusion = Spell.none(lead, np.zeros((*lead, m))), Spell.none(lead, np.zeros(lead)[()])
+        self._outlier_frames, self._occlusion_frames = (
+            max(1, round(each / interval)) for each in durations
+        )
+        self._outlier, self._occlusion = (
+            Spell.none(lead, np.zeros((*lead, m))),
+            Spell.none(lead, np.zeros(lead)[()]),
+        )
         self._due: FloatArray = np.zeros(lead)[()]
 
     def measured(self, feature: FloatArray) -> FloatArray:
@@ -81,8 +103,12 @@ class Sensor:
             noise = self._noise.next()
             feature = feature + (np.matvec(self._shape, noise) if self._shape.size else noise)
         if config.outliers > 0.0:
-            begins = self._outlier_begins.next() < begin_probability(config.outliers, self._outlier_frames)
-            self._outlier = self._outlier.next(begins, self._outlier_frames, self._outlier_values.next())
+            begins = self._outlier_begins.next() < begin_probability(
+                config.outliers, self._outlier_frames
+            )
+            self._outlier = self._outlier.next(
+                begins, self._outlier_frames, self._outlier_values.next()
+            )
             feature = where(self._outlier.inside, feature + self._outlier.value, feature)
         return quantise(feature, self._quantum) if self._quantum > 0.0 else feature
 
@@ -92,9 +118,17 @@ class Sensor:
         if config.drop_probability > 0.0:
             absent = self._losses.next() < config.drop_probability
         if config.occlusions > 0.0:
-            begins = self._occlusion_begins.next() < begin_probability(config.occlusions, self._occlusion_frames)
-            self._occlusion = self._occlusion.next(begins, self._occlusion_frames, self._occlusion.value)
-            absent = self._occlusion.inside if absent is None else np.logical_or(absent, self._occlusion.inside)
+            begins = self._occlusion_begins.next() < begin_probability(
+                config.occlusions, self._occlusion_frames
+            )
+            self._occlusion = self._occlusion.next(
+                begins, self._occlusion_frames, self._occlusion.value
+            )
+            absent = (
+                self._occlusion.inside
+                if absent is None
+                else np.logical_or(absent, self._occlusion.inside)
+            )
         if any(begin <= time + TIME_TOLERANCE < end for begin, end in config.occlusion_windows):
             absent = np.ones_like(self._occlusion.inside)[()]
         return absent if absent is not None and absent.any() else None
@@ -108,8 +142,14 @@ class Sensor:
             size: of a sub-step, s.
         """
         config = self._config
-        swing = config.latency_swing / size * (1.0 + math.sin(2.0 * math.pi * step * size / config.swing_period))
-        self._due = np.maximum(self._due, step + latency + swing + config.jitter / size * self._lateness.next())
+        swing = (
+            config.latency_swing
+            / size
+            * (1.0 + math.sin(2.0 * math.pi * step * size / config.swing_period))
+        )
+        self._due = np.maximum(
+            self._due, step + latency + swing + config.jitter / size * self._lateness.next()
+        )
         return self._due
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:

@@ -33,7 +33,9 @@ from servobench.plant.contract.lanes import norm, outer
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
-NEAR: Final = 0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
+NEAR: Final = (
+    0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
+)
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 BISECTIONS: Final = 60  # from r = 1000 down to rounding
 AXIS: Final = 1e-24  # [1] added to r², so that a fisheye has a derivative on the optical axis
@@ -79,7 +81,9 @@ def project(points: FloatArray, optics: Optics) -> FloatArray:
     """
     a, k, further = points[..., :2] / _depth(points), optics.distortion, optics.further
     if further is not None:
-        return optics.centre[..., None, :] + optics.focal_lengths[..., None, :] * _bent(a, k, further)
+        return optics.centre[..., None, :] + optics.focal_lengths[..., None, :] * _bent(
+            a, k, further
+        )
     stretch = 1.0 + k[..., None] * (a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1])
     return optics.centre[..., None, :] + (optics.focal[..., None] * stretch)[..., None] * a
 
@@ -128,7 +132,8 @@ def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
 def _undistorted(bent: FloatArray, k: FloatArray) -> FloatArray:
     """Return a, (..., c, p, 2), of which (1 + k r²) a = `bent`; Newton's method on r."""
     wanted = norm(bent)
-    most = np.where(k < 0.0, 1.0 / np.sqrt(3.0 * np.maximum(-k, 1e-12)), np.inf)  # where r (1 + k r²) turns back
+    # Where r (1 + k r²) turns back
+    most = np.where(k < 0.0, 1.0 / np.sqrt(3.0 * np.maximum(-k, 1e-12)), np.inf)
     r = np.minimum(wanted, 0.9 * most)
     for _ in range(NEWTON_STEPS):
         slope = np.maximum(1.0 + 3.0 * k * r**2, 1e-3)
@@ -156,7 +161,9 @@ def _radial(a: FloatArray, k1: FloatArray, further: FloatArray) -> tuple[FloatAr
     return s, stretch, change, p1, p2
 
 
-def _bent_angle(angle: FloatArray, k1: FloatArray, further: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _bent_angle(
+    angle: FloatArray, k1: FloatArray, further: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸) of a fisheye and its derivative by θ, (..., c, p) each."""
     k2, k3, k4 = (further[..., i, None] for i in (1, 4, 6))
     t = angle * angle
@@ -238,7 +245,8 @@ def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArra
     if optics.further is not None:
         turning = optics.further[..., 5]
     elif (optics.distortion < 0.0).any():
-        turning = 1.0 / (3.0 * np.maximum(-optics.distortion, 1e-12))  # r² at which r (1 + k r²) turns back
+        # R² at which r (1 + k r²) turns back
+        turning = 1.0 / (3.0 * np.maximum(-optics.distortion, 1e-12))
     if turning is not None:
         a = points[..., :2] / _depth(points)
         inside &= np.vecdot(a, a) <= turning[..., None]

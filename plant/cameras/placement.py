@@ -57,7 +57,9 @@ class CameraDraws:
 
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists, for JSON."""
-        return {f"camera_{field.name}": getattr(self, field.name).tolist() for field in fields(self)}
+        return {
+            f"camera_{field.name}": getattr(self, field.name).tolist() for field in fields(self)
+        }
 
 
 def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
@@ -82,8 +84,14 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
 def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
     """Return the rotation vector, (3,) rad, of a further camera, drawn as for the first one."""
     angle = mismatch.size("camera_rotation")
-    axis = draw_camera_axis(angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}"))
-    share = 1.0 if mismatch.camera_exact else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
+    axis = draw_camera_axis(
+        angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}")
+    )
+    share = (
+        1.0
+        if mismatch.camera_exact
+        else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
+    )
     return np.asarray(share * angle * axis)
 
 
@@ -100,11 +108,18 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
     if robot.camera is not None:
         _check_fit(robot.camera, setup, mount)
     c = setup.cameras
-    draws = CameraDraws(np.ones(c), np.zeros((c, 2)), np.zeros(c), np.zeros((c, 3)), np.zeros((c, 3)))
+    draws = CameraDraws(
+        np.ones(c), np.zeros((c, 2)), np.zeros(c), np.zeros((c, 3)), np.zeros((c, 3))
+    )
     model = _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), draws)
     home = robot.workspace.home
-    if robot.camera is not None and not (model.distance > NEAR and model.valid_at(model.points(home)).all()):
-        where = [[round(value, 3) for value in point] for point in model.point_motions(home)[0][0].tolist()]
+    if robot.camera is not None and not (
+        model.distance > NEAR and model.valid_at(model.points(home)).all()
+    ):
+        where = [
+            [round(value, 3) for value in point]
+            for point in model.point_motions(home)[0][0].tolist()
+        ]
         raise ValueError(
             f"camera {robot.camera.name} does not see the target with the arm at home: the target is at "
             f"{where} m in the camera's frame (x right, y down, z ahead); wanted another pose, mount or target"
@@ -112,7 +127,9 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
     if robot.camera is not None and (radius := robot.camera.keys.target.radius) is not None:
         size, height = 2.0 * robot.pinhole.focal * radius / model.distance, robot.pinhole.height
         if size > MAX_SIZE * height:
-            remark(f"{robot.camera.name}: the ball takes {size:.0f} px of an image {height} px high; is it its radius?")
+            remark(
+                f"{robot.camera.name}: the ball takes {size:.0f} px of an image {height} px high; is it its radius?"
+            )
     return model
 
 
@@ -124,7 +141,9 @@ def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
         other = setup.name if mount == "hand" else f"{setup.name}:hand"
         raise ValueError(f"camera {name} is on the {off}; use the sensing {other}")
     if camera.keys.target.frame == on:
-        raise ValueError(f"camera {name}: the target must be on the {off} where the camera is on the {on}")
+        raise ValueError(
+            f"camera {name}: the target must be on the {off} where the camera is on the {on}"
+        )
     if (camera.second is None) != (setup.cameras == 1):
         raise ValueError(
             f"sensing {setup.name} has {setup.cameras} cameras, and {name} describes {2 - (camera.second is None)}; "
@@ -133,7 +152,12 @@ def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
 
 
 def true_model(
-    setup: SensingSetup, mount: Mount, robot: Robot, arm: SerialArm, turn: FloatArray, draws: CameraDraws
+    setup: SensingSetup,
+    mount: Mount,
+    robot: Robot,
+    arm: SerialArm,
+    turn: FloatArray,
+    draws: CameraDraws,
 ) -> SetupModel:
     """Return a true arm with cameras as drawn.
 
@@ -151,7 +175,9 @@ def true_model(
     nominal = nominal_model(setup, mount, robot)
     turns = [turn, *draws.turn[1:]]
     pivot = nominal.pivot(robot.workspace.centre)
-    cameras = np.stack([turn_about(pose, each, pivot) for pose, each in zip(nominal.cameras, turns, strict=True)])
+    cameras = np.stack(
+        [turn_about(pose, each, pivot) for pose, each in zip(nominal.cameras, turns, strict=True)]
+    )
     if mount == "hand":
         cameras[:, :3, :3] @= rotation_matrix(draws.mount)
         cameras[:, :3, 3] += arm.tool - robot.arm.tool
@@ -165,14 +191,24 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
         ValueError: more cameras than there are places for.
     """
     if setup.cameras not in (1, 2):
-        raise ValueError(f"{setup.name} needs {setup.cameras} cameras, and there are places for one or two")
+        raise ValueError(
+            f"{setup.name} needs {setup.cameras} cameras, and there are places for one or two"
+        )
     work, own = robot.workspace, robot.camera
     if own is not None and own.keys.pose.frame:
-        return np.stack([each.keys.pose.matrix for each in (own, own.second)[: setup.cameras] if each is not None])
+        return np.stack(
+            [
+                each.keys.pose.matrix
+                for each in (own, own.second)[: setup.cameras]
+                if each is not None
+            ]
+        )
     if mount == "fixed":
         above, distance = work.camera_pose()[:3, :3], setup.closeness * work.camera_distance
         front = rotation_matrix([0.0, SIDE, 0.0]) @ above
-        return np.stack([camera_pose(R, work.centre, distance) for R in (above, front)[: setup.cameras]])
+        return np.stack(
+            [camera_pose(R, work.centre, distance) for R in (above, front)[: setup.cameras]]
+        )
     poses = np.stack([np.eye(4)] * setup.cameras)
     poses[:, :3, 3] = robot.arm.tool
     if setup.cameras == 2:
@@ -185,13 +221,19 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
 
 
 def _model(
-    setup: SensingSetup, mount: Mount, robot: Robot, arm: SerialArm, cameras: FloatArray, draws: CameraDraws
+    setup: SensingSetup,
+    mount: Mount,
+    robot: Robot,
+    arm: SerialArm,
+    cameras: FloatArray,
+    draws: CameraDraws,
 ) -> SetupModel:
     work, own = robot.workspace, robot.camera
     home, far = robot.arm.frames(work.home)[-1], work.camera_distance
     points = np.array(setup.target)
     side = None if own is None else own.keys.target.side
-    shape = work.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))  # about its middle
+    # About its middle
+    shape = work.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))
     if mount == "fixed":
         distance = setup.closeness * far
         if own is not None:
@@ -207,7 +249,17 @@ def _model(
                 ahead = (np.array(own.keys.target.position) - home[:3, 3]) @ home[:3, :3]
                 distance = float((ahead - pose[:3, 3]) @ pose[:3, 2])
         target = (shape + ahead) @ home[:3, :3].T + home[:3, 3]
-    return SetupModel(arm, setup, mount, cameras, _optics(setup, robot, draws), target, distance, robot.pinhole, far)
+    return SetupModel(
+        arm,
+        setup,
+        mount,
+        cameras,
+        _optics(setup, robot, draws),
+        target,
+        distance,
+        robot.pinhole,
+        far,
+    )
 
 
 def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:
@@ -220,7 +272,10 @@ def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:
         focal, centre = K[:, 0, 0], K[:, :2, 2]
         distortion = np.array([each.distortion[0] for each in own]) + draws.distortion
         further = _further(own, distortion)
-        if further.shape[1] == COLUMNS["plumb_bob"] and (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all():
+        if (
+            further.shape[1] == COLUMNS["plumb_bob"]
+            and (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all()
+        ):
             further = None
     return Optics(focal * draws.focal, centre + draws.centre, distortion, optics.size, further)
 

@@ -4,14 +4,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
-from servobench.plant.cameras.placement import ON_HAND, OPTICAL, CameraDraws, draw_cameras, nominal_model, true_model
+from servobench.plant.cameras.placement import (
+    ON_HAND,
+    OPTICAL,
+    CameraDraws,
+    draw_cameras,
+    nominal_model,
+    true_model,
+)
 from servobench.plant.cameras.setups import PIXEL, PLATE, POSITION, STEREO, Mount, SensingSetup
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample
 from servobench.plant.robot.robot import Robot
 
-SETUPS: Final[Mapping[str, SensingSetup]] = {setup.name: setup for setup in (POSITION, PIXEL, STEREO, PLATE)}
+SETUPS: Final[Mapping[str, SensingSetup]] = {
+    setup.name: setup for setup in (POSITION, PIXEL, STEREO, PLATE)
+}
 FIXED: Final = "fixed"
 HAND: Final = "hand"
 DEFAULT_SENSING: Final = "position"
@@ -53,10 +62,17 @@ class Sensing:
         Raises:
             ValueError: the arm has too few joints for the set-up.
         """
-        return robot.nominal if self._is_plain(robot) else nominal_model(self.setup, self.mount, robot)
+        return (
+            robot.nominal if self._is_plain(robot) else nominal_model(self.setup, self.mount, robot)
+        )
 
     def true(
-        self, robot: Robot, true: HandEyeModel, sample: MismatchSample, mismatch: Mismatch, seed: int
+        self,
+        robot: Robot,
+        true: HandEyeModel,
+        sample: MismatchSample,
+        mismatch: Mismatch,
+        seed: int,
     ) -> tuple[RobotModel, CameraDraws | None]:
         """Return a true robot under this sensing, and the values drawn for its cameras; None for none.
 
@@ -72,9 +88,13 @@ class Sensing:
         """
         for axis, _ in mismatch.axes:
             if axis in OPTICAL and self.setup.name == POSITION.name:
-                raise ValueError(f"mismatch axis {axis} needs a camera that sees pixels, such as the sensing pixel")
+                raise ValueError(
+                    f"mismatch axis {axis} needs a camera that sees pixels, such as the sensing pixel"
+                )
             if axis == ON_HAND and self.mount != HAND:
-                raise ValueError(f"mismatch axis {axis} needs a camera on the hand, such as the sensing pixel:{HAND}")
+                raise ValueError(
+                    f"mismatch axis {axis} needs a camera on the hand, such as the sensing pixel:{HAND}"
+                )
         if self._is_plain(robot):
             return true, None
         draws = draw_cameras(mismatch, self.setup.cameras, seed)

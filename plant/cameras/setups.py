@@ -48,7 +48,9 @@ DIFFERENCE: Final = 1e-6  # share of the motions over which features are differe
 CHECKED: Final = 1e-3  # the same for a `measure` in single precision, and where `rates` are checked
 FLOATS: Final = (np.float64, np.float32)  # that `measure` and `rates` may return
 POSES: Final = 5  # of the target, at which the functions of a user's set-up are checked
-RATE_TOLERANCE: Final = 1e-3  # [1] of the fastest rate, by which `rates` may differ from the derivative
+RATE_TOLERANCE: Final = (
+    1e-3  # [1] of the fastest rate, by which `rates` may differ from the derivative
+)
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,9 @@ class SensingSetup:
             raise ValueError(f"sensing {self.name}: features must be one name or more, got none")
         if self.scale is None and self.unit not in EXTENTS:
             wanted = "scale=lambda focal, distance: NUMBER, by how much they change with a metre of motion"
-            raise ValueError(f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}")
+            raise ValueError(
+                f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}"
+            )
         if self.single and self.m % (count := self.cameras * len(self.target)):
             raise ValueError(
                 f"sensing {self.name}: single needs as many features for each of {count} points, got {self.m}"
@@ -111,7 +115,9 @@ class SensingSetup:
     def channel(self, focal: float, distance: float) -> Channel:
         """Return names, unit and natural size of the features, for a focal length [px] and a `distance` [m]."""
         free = np.full(self.m, np.inf)
-        return Channel(self.features, self.unit, self.size(focal, distance), -free, free, self.tolerance)
+        return Channel(
+            self.features, self.unit, self.size(focal, distance), -free, free, self.tolerance
+        )
 
     def size(self, focal: float, distance: float) -> float:
         """Return the natural size of a feature, in its unit, for a focal length [px] and a `distance` [m]."""
@@ -125,7 +131,9 @@ class SensingSetup:
             return self.rates(points, motions, optics)
         return self._differences(points, motions, optics, self._step)
 
-    def _differences(self, points: FloatArray, motions: FloatArray, optics: Optics, h: float) -> FloatArray:
+    def _differences(
+        self, points: FloatArray, motions: FloatArray, optics: Optics, h: float
+    ) -> FloatArray:
         step = h * np.moveaxis(motions, -1, 0)
         there, back = self.measure(points + step, optics), self.measure(points - step, optics)
         return np.ascontiguousarray(np.moveaxis((there - back) / (2.0 * h), 0, -1))
@@ -133,14 +141,20 @@ class SensingSetup:
     @cached_property
     def _step(self) -> float:
         """Share of the motions for `_differences`, by whether `measure` tells apart motions that are far smaller."""
-        fine, coarse = (self._differences(*self._places(), h) for h in (RATE_TOLERANCE * DIFFERENCE, CHECKED))
+        fine, coarse = (
+            self._differences(*self._places(), h) for h in (RATE_TOLERANCE * DIFFERENCE, CHECKED)
+        )
         lost = np.abs(coarse)[fine == 0.0] > RATE_TOLERANCE * np.median(np.abs(coarse))
         return CHECKED if lost.any() else DIFFERENCE
 
     def _places(self) -> tuple[FloatArray, FloatArray, Optics]:
         """Return a few places of the target in front of the cameras, two motions of it, and the optics; see `rates`."""
         draw = np.random.default_rng(0).uniform
-        beside = np.array([0.0, 0.0, 1.0]) - np.arange(self.cameras)[:, None, None] * [0.1, 0.0, 0.0]
+        beside = np.array([0.0, 0.0, 1.0]) - np.arange(self.cameras)[:, None, None] * [
+            0.1,
+            0.0,
+            0.0,
+        ]
         points = np.array(self.target) + beside + draw(-0.05, 0.05, (POSES, 1, 1, 3))
         moved, turned = draw(-1.0, 1.0, (2, POSES, 1, 1, 3, 2))  # of a rigid target
         motions = moved + np.cross(turned, np.array(self.target)[..., None], axis=-2)
@@ -166,20 +180,33 @@ class SensingSetup:
             raise ConfigurationError(f"sensing {self.name}: measure and rates {wanted}")
         differences = self._differences(points, motions, optics, CHECKED)
         wrong = np.abs(rates - differences).max(axis=(0, 2))
-        if self.rates is not None and not (wrong <= RATE_TOLERANCE * np.abs(differences).max()).all():
+        if (
+            self.rates is not None
+            and not (wrong <= RATE_TOLERANCE * np.abs(differences).max()).all()
+        ):
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"
             )
 
-    def _check_array(self, name: str, made: object, shape: tuple[int, ...], points: FloatArray) -> None:
+    def _check_array(
+        self, name: str, made: object, shape: tuple[int, ...], points: FloatArray
+    ) -> None:
         """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
         if type(made) is not np.ndarray or made.shape != shape or made.dtype not in FLOATS:
-            came = f"{made.dtype} of shape {made.shape}" if type(made) is np.ndarray else type(made).__name__
+            came = (
+                f"{made.dtype} of shape {made.shape}"
+                if type(made) is np.ndarray
+                else type(made).__name__
+            )
             wanted = f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :]"
-            raise ConfigurationError(f"sensing {self.name}: {name} must return {wanted}, got {came}")
+            raise ConfigurationError(
+                f"sensing {self.name}: {name} must return {wanted}, got {came}"
+            )
         if not np.isfinite(made).all():
-            raise ConfigurationError(f"sensing {self.name}: {name} must return finite numbers, got {made.tolist()}")
+            raise ConfigurationError(
+                f"sensing {self.name}: {name} must return finite numbers, got {made.tolist()}"
+            )
 
     def valid(self, found: BoolArray) -> BoolArray:
         """Return which features are measured, (..., m), where the points (..., c, p) are found or not."""
@@ -220,7 +247,12 @@ in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, 
 HALF: Final = 0.12  # [m] half side of the plate's square, at the corners of which the discs are
 
 POSITION = SensingSetup(
-    "position", "the ball in 3-D, by a camera with depth", ("x", "y", "z"), "m", position, position_rates
+    "position",
+    "the ball in 3-D, by a camera with depth",
+    ("x", "y", "z"),
+    "m",
+    position,
+    position_rates,
 )
 PIXEL = in_pixels("pixel", "the ball in the image of one camera", ("u", "v"))
 STEREO = in_pixels(
@@ -234,7 +266,8 @@ PLATE = in_pixels(
     "plate",
     "four discs on a plate, for position and orientation",
     ("u1", "v1", "u2", "v2", "u3", "v3", "u4", "v4"),
-    tolerance=2.0 * SETTLING_BAND,  # four discs measure a motion of the plate, as long as it does not turn
+    tolerance=2.0
+    * SETTLING_BAND,  # four discs measure a motion of the plate, as long as it does not turn
     target=((-HALF, -HALF, 0.0), (HALF, -HALF, 0.0), (HALF, HALF, 0.0), (-HALF, HALF, 0.0)),
     closeness=0.5,  # the orientation of a plate that is small in the image is measured badly
     least_joints=6,
@@ -255,7 +288,9 @@ class SetupModel(RobotModel):
     arm: SerialArm  # the arm
     setup: SensingSetup  # the set-up
     mount: Mount  # of the cameras
-    cameras: FloatArray  # (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
+    cameras: (
+        FloatArray  # (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
+    )
     optics: Optics  # their intrinsics
     target: FloatArray  # (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
     distance: float  # from the cameras to the target in the middle of the workspace, as planned [m]
@@ -352,13 +387,17 @@ class SetupModel(RobotModel):
     def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
         """Return which features are valid, (..., m), for points in the frame of each camera, (..., c, p, 3) m."""
         front = _incidence(points) > MIN_INCIDENCE
-        return self.setup.valid(np.logical_and(in_image(points, self.optics, share), front[..., None]))
+        return self.setup.valid(
+            np.logical_and(in_image(points, self.optics, share), front[..., None])
+        )
 
     def _in_base(self, flange: FloatArray) -> FloatArray:
         """Return the target in the base frame, (..., p, 3) m."""
         if self.mount == "hand":
             return self.target
-        return np.asarray(np.matvec(flange[..., None, :3, :3], self.target) + flange[..., None, :3, 3])
+        return np.asarray(
+            np.matvec(flange[..., None, :3, :3], self.target) + flange[..., None, :3, 3]
+        )
 
     def _mounted(self, flange: FloatArray, at: FloatArray) -> FloatArray:
         """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
@@ -369,7 +408,9 @@ class SetupModel(RobotModel):
     def in_cameras(self, points: FloatArray) -> FloatArray:
         """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
         cameras = self.cameras[..., None, :, :]
-        return np.asarray(np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3]))
+        return np.asarray(
+            np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3])
+        )
 
 
 def _incidence(points: FloatArray) -> FloatArray:

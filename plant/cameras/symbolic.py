@@ -67,7 +67,9 @@ class SetupGeometry:
 
     arm: ArmGeometry  # the arm
     target: list[SX]  # p points, each (3,) [m]
-    cameras: list[tuple[SX, SX]]  # of c cameras rotation (3, 3) and position (3,) [m] in the frame of their mount
+    cameras: list[
+        tuple[SX, SX]
+    ]  # of c cameras rotation (3, 3) and position (3,) [m] in the frame of their mount
     optics: Optics  # their intrinsics
 
     @classmethod
@@ -87,7 +89,9 @@ def symbolic_feature(model: RobotModel) -> casadi.Function:
     setup = POSITION
     mount: Mount = "fixed"
     if isinstance(model, HandEyeModel):
-        geometry = SetupGeometry.of(model.arm, model.arm.tool[None], model.X_BC[None], ideal_optics(CAMERA, 1))
+        geometry = SetupGeometry.of(
+            model.arm, model.arm.tool[None], model.X_BC[None], ideal_optics(CAMERA, 1)
+        )
     elif isinstance(model, SetupModel):
         setup, mount = model.setup, model.mount
         geometry = SetupGeometry.of(model.arm, model.target, model.cameras, model.optics)
@@ -122,7 +126,9 @@ def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
     Raises:
         ValueError: the set-up's function cannot be carried out over expressions.
     """
-    with configuration_errors(f"sensing {setup.name} has no symbolic twin: ", TypeError, AttributeError, RuntimeError):
+    with configuration_errors(
+        f"sensing {setup.name} has no symbolic twin: ", TypeError, AttributeError, RuntimeError
+    ):
         made: Any = setup.measure(points, optics)
     return casadi.vertcat(*made[0].tolist())
 
@@ -131,14 +137,20 @@ def valid_features(points: Expressions, optics: Optics, setup: SensingSetup) -> 
     """Return which features of points (1, c, p, 3) are valid, (m, 1) of ones and zeros; see `SetupModel.valid_at`."""
     pixels, half = project(points, optics)[0], 0.5 * np.array(optics.size)
     seen = []
-    for camera, (points_of_camera, pixels_of_camera) in enumerate(zip(points[0], pixels, strict=True)):
+    for camera, (points_of_camera, pixels_of_camera) in enumerate(
+        zip(points[0], pixels, strict=True)
+    ):
         front = _shows_front(points_of_camera)
         for point, pixel in zip(points_of_camera, pixels_of_camera, strict=True):
             inside = [casadi.fabs(pixel[axis] - half[axis]) <= half[axis] for axis in (0, 1)]
             if optics.further is not None:
                 far = optics.further[camera, 5] * casadi.fmax(point[2], NEAR) ** 2
                 inside[0] = casadi.logic_and(inside[0], point[0] ** 2 + point[1] ** 2 <= far)
-            seen.append(casadi.logic_and(casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)))
+            seen.append(
+                casadi.logic_and(
+                    casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)
+                )
+            )
     if setup.single:
         return casadi.vertcat(*(each for each in seen for _ in range(setup.m // len(seen))))
     return casadi.vertcat(*[reduce(casadi.logic_and, seen)] * setup.m)
@@ -158,11 +170,17 @@ def symbolic_rotation(rpy: SX) -> SX:
     """Return Rz(yaw) Ry(pitch) Rx(roll), (3, 3), as `servobench.plant.robot.arm.rotation_from_rpy`."""
     c: SX = casadi.cos(rpy)
     s: SX = casadi.sin(rpy)
-    roll = casadi.vertcat(casadi.horzcat(1, 0, 0), casadi.horzcat(0, c[0], -s[0]), casadi.horzcat(0, s[0], c[0]))
-    pitch = casadi.vertcat(casadi.horzcat(c[1], 0, s[1]), casadi.horzcat(0, 1, 0), casadi.horzcat(-s[1], 0, c[1]))
+    roll = casadi.vertcat(
+        casadi.horzcat(1, 0, 0), casadi.horzcat(0, c[0], -s[0]), casadi.horzcat(0, s[0], c[0])
+    )
+    pitch = casadi.vertcat(
+        casadi.horzcat(c[1], 0, s[1]), casadi.horzcat(0, 1, 0), casadi.horzcat(-s[1], 0, c[1])
+    )
     return _turn_z(rpy[2]) @ pitch @ roll
 
 
 def _turn_z(angle: SX) -> SX:
     c, s = casadi.cos(angle), casadi.sin(angle)
-    return casadi.vertcat(casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1))
+    return casadi.vertcat(
+        casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1)
+    )

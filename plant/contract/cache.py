@@ -34,12 +34,17 @@ EXTRACTED: Final = "extracted"  # kind of unpacked FMUs
 BUILT: Final = "fmus"  # kind of FMUs that were built here
 CODE: Final = (EXTRACTED, BUILT)  # kinds whose files are loaded as code
 PRIVATE: Final = 0o700  # mode of a folder that is for its owner only
-NOT_ALLOWED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)  # errors of a folder that this user may not write
-PLAIN: Final = re.compile(r"[\w.~/-]*", re.ASCII)  # a path that reads the same in a URI, which an FMU gets
+# Errors of a folder that this user may not write
+NOT_ALLOWED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+# A path that reads the same in a URI, which an FMU gets
+PLAIN: Final = re.compile(r"[\w.~/-]*", re.ASCII)
 LOCK_TIME: Final = 10.0  # [s] for another process to move its entry
 LOCK_PAUSE: Final = 0.01  # [s] between two tries
-LOCK_FLAGS: Final = os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK  # also for a pipe, and the file of another user
-MAX_ENTRIES: Final = 32  # number of entries of a kind that are kept if they are older than `MIN_AGE`
+# Also for a pipe, and the file of another user
+LOCK_FLAGS: Final = os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK
+MAX_ENTRIES: Final = (
+    32  # number of entries of a kind that are kept if they are older than `MIN_AGE`
+)
 MIN_AGE: Final = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
 MAX_AGE: Final = 90 * 24 * 3600.0  # [s] since its last use, above which an entry is removed
 
@@ -75,7 +80,9 @@ def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
     root = entry.parent.parent
     user = _user_cache()
     if root != user and (user is None or not _is_writable(user)):
-        remark(f"no cache folder can be written; {root} takes its place: let XDG_CACHE_HOME name one that stays")
+        remark(
+            f"no cache folder can be written; {root} takes its place: let XDG_CACHE_HOME name one that stays"
+        )
     return entry / FILES
 
 
@@ -91,7 +98,9 @@ def _folders(kind: str) -> list[Path]:
         if root is not None and (may_be_shared or _is_private(root / kind)):
             folders.append(root / kind)
     if kind in CODE:
-        folders.sort(key=lambda folder: forbids_code(folder) or PLAIN.fullmatch(str(folder)) is None)
+        folders.sort(
+            key=lambda folder: forbids_code(folder) or PLAIN.fullmatch(str(folder)) is None
+        )
     if not folders:
         raise ValueError(
             f"other users could write code into the cache folders {user} and {temporary}; let XDG_CACHE_HOME name a "
@@ -136,7 +145,8 @@ def _is_private(folder: Path) -> bool:
         writers = stat.S_IWOTH
         if found.st_gid != found.st_uid:
             writers |= stat.S_IWGRP
-        kept_apart = each != folder and found.st_mode & stat.S_ISVTX  # as in /tmp: entries stay their owners'
+        # As in /tmp: entries stay their owners'
+        kept_apart = each != folder and found.st_mode & stat.S_ISVTX
         if found.st_mode & writers and not kept_apart:
             return False
     return True
@@ -218,7 +228,9 @@ def _prune(kind: Path) -> None:
     entries = sorted((path for path in ages if path.is_dir()), key=lambda path: ages[path])
     for place, entry in enumerate(entries):
         unfinished = entry.name.startswith(UNFINISHED)
-        if ages[entry] > MAX_AGE or (ages[entry] > MIN_AGE and (unfinished or place >= MAX_ENTRIES)):
+        if ages[entry] > MAX_AGE or (
+            ages[entry] > MIN_AGE and (unfinished or place >= MAX_ENTRIES)
+        ):
             with contextlib.suppress(OSError):  # It may be another user's.
                 _remove(entry)
 

@@ -16,10 +16,12 @@ from typing import Final
 from servobench.plant.contract.files import partial_path, sync, write_atomically
 
 SUMS: Final = "SHA256SUMS"
-LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>(?!/|(.*/)?\.\.?(/|$))\S[^\0]*)")  # within the folder
+# Within the folder
+LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>(?!/|(.*/)?\.\.?(/|$))\S[^\0]*)")
 TABLE_END: Final = b"PAR1"  # the last bytes of a Parquet file
 
-Sums = Mapping[str, frozenset[str]]  # the digests that a file may have, by its name within the folder
+# The digests that a file may have, by its name within the folder
+Sums = Mapping[str, frozenset[str]]
 
 
 def write_vouched(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> None:

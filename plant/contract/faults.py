@@ -19,7 +19,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Final
 
-MAX_LENGTH: Final = 4000  # characters of a message; a longer one repeats something that a file holds
+MAX_LENGTH: Final = (
+    4000  # characters of a message; a longer one repeats something that a file holds
+)
 
 
 class RunFault(RuntimeError):
@@ -70,7 +72,9 @@ class ConfigurationError(ValueError):
         if len(words) > MAX_LENGTH:
             half = MAX_LENGTH // 2
             words = f"{words[:half]} ... {words[-half:]}"
-        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in words))
+        super().__init__(
+            "".join(each if each.isprintable() else repr(each)[1:-1] for each in words)
+        )
 
 
 @contextmanager

@@ -18,22 +18,33 @@ if TYPE_CHECKING:
     from servobench.plant.contract.checks import FloatArray
 
 # The begin of a formula that a spreadsheet runs: in a cell, or behind a mark that some countries put between cells.
-FORMULA: Final = re.compile("^(?=[=+\\-@\t\uff1d\uff0b\uff0d\uff20])|(?<=[;\t])(?=[=+\\-@\uff1d\uff0b\uff0d\uff20])")
+FORMULA: Final = re.compile(
+    "^(?=[=+\\-@\t\uff1d\uff0b\uff0d\uff20])|(?<=[;\t])(?=[=+\\-@\uff1d\uff0b\uff0d\uff20])"
+)
 CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 TOML_TEXT: Final = re.compile(  # a text of any of four kinds, or a comment
-    r'''"""(?:[^"\\]++|\\.|""?+(?!"))*+"{3,5}|\'{3}.*?\'{3,5}|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*'|#[^\n]*''', re.DOTALL
+    r'''"""(?:[^"\\]++|\\.|""?+(?!"))*+"{3,5}|\'{3}.*?\'{3,5}|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*'|#[^\n]*''',
+    re.DOTALL,
 )
 MAX_KEY_PARTS: Final = 32
-TOML_LONG_KEY: Final = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}""")
+TOML_LONG_KEY: Final = re.compile(
+    rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}"""
+)
 MAX_TOML: Final = 500_000  # [letters] beside texts and comments
 MAX_KEY: Final = 10_000  # [letters]
-AROUND_FILE: Final = re.compile("[=:]")  # marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
+# Marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
+AROUND_FILE: Final = re.compile("[=:]")
 MAX_MARKS: Final = 16  # that a path in a list may have
 TIME: Final = "time_s"  # column of a table
 TIME_KINDS: Final = ("m", "M")  # numpy's kinds of durations and dates
-SECONDS: Final = f"for a column {TIME} in s, take (times - times[0]).total_seconds(), of a column by .dt"
-MAX_NUMBER: Final = 1e30  # beyond which no quantity is, and squares of errors are near the largest number
-PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
+SECONDS: Final = (
+    f"for a column {TIME} in s, take (times - times[0]).total_seconds(), of a column by .dt"
+)
+MAX_NUMBER: Final = (
+    1e30  # beyond which no quantity is, and squares of errors are near the largest number
+)
+# Name of a file that is being written, or whose process was killed
+PARTIAL: Final = re.compile(r"\..+-\d+-\d+")
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -51,7 +62,9 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         partial.replace(path)
         sync(path.parent)
     except OSError as error:
-        if error.errno is not None and str(error.filename or partial) == str(partial):  # a full disk names no file
+        if error.errno is not None and str(error.filename or partial) == str(
+            partial
+        ):  # a full disk names no file
             error.filename = str(path)  # that of the user
         raise
     finally:
@@ -105,8 +118,15 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
         yield
     except OSError as error:
         file = Path(str(error.filename or path))
-        if path is not None and done == "written" and path not in (file, *file.parents) and file not in path.parents:
-            raise ConfigurationError(f"{file}, which {path} needs, cannot be read: {reason(error)}") from error
+        if (
+            path is not None
+            and done == "written"
+            and path not in (file, *file.parents)
+            and file not in path.parents
+        ):
+            raise ConfigurationError(
+                f"{file}, which {path} needs, cannot be read: {reason(error)}"
+            ) from error
         if done == "written" and (error.errno is None or not (path or error.filename)):
             raise  # of a library that draws, or of no file in particular
         named = f"{kind} {path}" if kind else error.filename or path
@@ -125,7 +145,11 @@ def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not
             return cell
         return FORMULA.sub("'", harmless(cell))
 
-    texts = {str(name): column.map(quoted) for name, column in table.items() if column.dtype.kind not in "biufM"}
+    texts = {
+        str(name): column.map(quoted)
+        for name, column in table.items()
+        if column.dtype.kind not in "biufM"
+    }
     safe = table.assign(**texts).rename(columns=quoted)
     write_atomically(path, lambda partial: safe.to_csv(partial, index=False))
 
@@ -158,9 +182,13 @@ def parse_toml(text: str) -> dict[str, Any]:
 
     bare = TOML_TEXT.sub('"', text)
     if long := TOML_LONG_KEY.search(bare):
-        raise ValueError(f"the key {long[0][:20]}… has more than {MAX_KEY_PARTS} parts; nest no deeper")
+        raise ValueError(
+            f"the key {long[0][:20]}… has more than {MAX_KEY_PARTS} parts; nest no deeper"
+        )
     if len(bare) > MAX_TOML:
-        raise ValueError(f"it has {len(bare)} letters beside texts and comments; at most {MAX_TOML} are read")
+        raise ValueError(
+            f"it has {len(bare)} letters beside texts and comments; at most {MAX_TOML} are read"
+        )
     content = tomllib.loads(text)
     _refuse_long_keys(content)
     return content
@@ -172,7 +200,9 @@ def _refuse_long_keys(content: object) -> None:
     if isinstance(content, dict):
         for key in content:
             if len(key) > MAX_KEY:
-                raise ValueError(f"the key {key[:20]}… has {len(key)} letters; at most {MAX_KEY} are read")
+                raise ValueError(
+                    f"the key {key[:20]}… has {len(key)} letters; at most {MAX_KEY} are read"
+                )
         within = content.values()
     if isinstance(within, (str, bytes)) or not isinstance(within, Iterable):
         return
@@ -186,7 +216,9 @@ def read_text(kind: str, path: Path) -> str:
         try:
             return path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
-            raise ConfigurationError(f"{kind} {path} is no text in UTF-8; save it in this encoding") from error
+            raise ConfigurationError(
+                f"{kind} {path} is no text in UTF-8; save it in this encoding"
+            ) from error
 
 
 def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as above
@@ -205,9 +237,17 @@ def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as 
             f"{kind} {path} has {marks[0]!r} between its columns; write commas, and numbers as 0.5"
         )
     with configuration_errors(f"{kind} {path} is no table: ", OSError):
-        table = pd.read_parquet(path) if text is None else pd.read_csv(io.StringIO(text), skipinitialspace=True)
-    if text is not None and type(table.index) is not pd.RangeIndex:  # the first cells were taken for names of rows
-        raise ConfigurationError(f"{kind} {path} has rows of more cells than its header; write numbers as 0.5")
+        table = (
+            pd.read_parquet(path)
+            if text is None
+            else pd.read_csv(io.StringIO(text), skipinitialspace=True)
+        )
+    if (
+        text is not None and type(table.index) is not pd.RangeIndex
+    ):  # the first cells were taken for names of rows
+        raise ConfigurationError(
+            f"{kind} {path} has rows of more cells than its header; write numbers as 0.5"
+        )
     levels = [name for name in table.index.names if name is not None and name not in table]
     if not levels and table.index.dtype.kind in TIME_KINDS and TIME not in table:
         raise ConfigurationError(f"{kind} {path} has times as its index without a name; {SECONDS}")

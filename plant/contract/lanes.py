@@ -39,7 +39,11 @@ def map_arrays(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
     elif is_dataclass(tree) and not isinstance(tree, type):
         mapped = object.__new__(type(tree))
         for name in (field.name for field in fields(tree)):
-            object.__setattr__(mapped, name, map_arrays(function, *(getattr(each, name) for each in (tree, *others))))
+            object.__setattr__(
+                mapped,
+                name,
+                map_arrays(function, *(getattr(each, name) for each in (tree, *others))),
+            )
     return mapped
 
 
@@ -53,7 +57,12 @@ def stack(trees: Sequence[Tree]) -> Tree:
     return map_arrays(lambda *arrays: np.stack(arrays), *trees)
 
 
-def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
+def branch(
+    chosen: npt.ArrayLike,
+    function: Callable[..., Tree],
+    tree: Tree,
+    *arguments: Any,  # noqa: ANN401
+) -> Tree:
     """Return `function(tree, *arguments)` in the chosen lanes and `tree` in all others.
 
     Args:
@@ -80,11 +89,16 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
         new[lanes] = values
         return new
 
-    return map_arrays(replaced, tree, function(before, *(take(each, lanes) for each in arguments)), before)
+    return map_arrays(
+        replaced, tree, function(before, *(take(each, lanes) for each in arguments)), before
+    )
 
 
 def repeat(
-    condition: Callable[[Tree], npt.ArrayLike], function: Callable[[Tree], Tree], tree: Tree, at_most: int
+    condition: Callable[[Tree], npt.ArrayLike],
+    function: Callable[[Tree], Tree],
+    tree: Tree,
+    at_most: int,
 ) -> Tree:
     """Apply `function` up to `at_most` times in the lanes in which a condition still holds, and return the tree.
 
@@ -125,7 +139,11 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
 def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
     """Return `one` in the chosen lanes, (...), and `other` elsewhere; both may have further axes."""
     mask = np.asarray(chosen)
-    return np.where(mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)), one, other)
+    return np.where(
+        mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)),
+        one,
+        other,
+    )
 
 
 def outer(a: FloatArray, b: FloatArray) -> FloatArray:

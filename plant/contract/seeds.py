@@ -80,7 +80,9 @@ class Stream:
         self._seeds = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
         for seed in self._seeds:
             check_seed(seed)
-        self._generators: list[np.random.Generator] = []  # Made with the first block, as many streams are never used.
+        self._generators: list[
+            np.random.Generator
+        ] = []  # Made with the first block, as many streams are never used.
         self._name, self._draw, self._shape, self._factor = name, draw, (BLOCK, *shape), factor
         self._block: FloatArray = np.empty(0)
         self._used = BLOCK
@@ -88,7 +90,9 @@ class Stream:
     def next(self) -> FloatArray:
         """Return the next draw of each run, (..., *shape)."""
         if self._used == BLOCK:
-            self._generators = self._generators or [named_generator(seed, self._name) for seed in self._seeds]
+            self._generators = self._generators or [
+                named_generator(seed, self._name) for seed in self._seeds
+            ]
             drawn = [self._draw(generator, self._shape) for generator in self._generators]
             self._block = self._factor * (drawn[0] if self._single else np.stack(drawn, axis=1))
             self._used = 0
@@ -100,4 +104,7 @@ class Stream:
         """Drop the streams of all other lanes."""
         self._seeds = [self._seeds[lane] for lane in lanes]
         if self._generators:
-            self._generators, self._block = [self._generators[lane] for lane in lanes], self._block[:, lanes]
+            self._generators, self._block = (
+                [self._generators[lane] for lane in lanes],
+                self._block[:, lanes],
+            )

@@ -103,7 +103,9 @@ class SensingConfig:
                     f"later end, in s; got [{begin:g}, {end:g}]"
                 )
         if self.outlier_size == 0.0:
-            raise ValueError("outlier_size must be above 0, got 0; without outliers, leave outliers at 0")
+            raise ValueError(
+                "outlier_size must be above 0, got 0; without outliers, leave outliers at 0"
+            )
 
     def extents(self, unit: str = "m", scale: float = 1.0) -> Extents:
         """Return the lengths among the settings in multiples of a unit of noise.
@@ -120,7 +122,9 @@ class SensingConfig:
             size = getattr(self, name)
             if isinstance(size, str):
                 if unit != "px":
-                    raise ValueError(f"sensing.{name} is {size}, but the features are in {unit}; write it in {unit}")
+                    raise ValueError(
+                        f"sensing.{name} is {size}, but the features are in {unit}; write it in {unit}"
+                    )
                 size = float(size.removesuffix("px")) / scale
             sizes.append(size)
         return Extents(*sizes)
@@ -186,11 +190,15 @@ def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, f
     changes = {}
     for name, written, size in axes:
         axis = SENSOR_AXES[name]
-        check_field(name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size)
+        check_field(
+            name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size
+        )
         changes[axis.setting] = size
         if axis.family is not None:
             if "noise" in changes:
-                raise ValueError(f"noise is of one family, got {changes['noise']} and {axis.family}; give one of them")
+                raise ValueError(
+                    f"noise is of one family, got {changes['noise']} and {axis.family}; give one of them"
+                )
             changes["noise"] = axis.family
     return changes
 
@@ -203,7 +211,12 @@ TINY: Final = 2.0**-54
 
 
 def mixture(
-    generator: np.random.Generator, shape: Shape, *, share: float, offset: float, spread: float = 1.0
+    generator: np.random.Generator,
+    shape: Shape,
+    *,
+    share: float,
+    offset: float,
+    spread: float = 1.0,
 ) -> FloatArray:
     """Return numbers of two normal distributions.
 
@@ -215,10 +228,14 @@ def mixture(
         spread: κ, deviation of the second one.
     """
     second = generator.random(shape) < share
-    return np.where(second, spread, 1.0) * generator.standard_normal(shape) + np.where(second, offset, 0.0)
+    return np.where(second, spread, 1.0) * generator.standard_normal(shape) + np.where(
+        second, offset, 0.0
+    )
 
 
-def bimodal(generator: np.random.Generator, shape: Shape, *, share: float, offset: float) -> FloatArray:
+def bimodal(
+    generator: np.random.Generator, shape: Shape, *, share: float, offset: float
+) -> FloatArray:
     """Return normal numbers of deviation 1, with equal shares displaced to either side.
 
     Args:
@@ -232,7 +249,9 @@ def bimodal(generator: np.random.Generator, shape: Shape, *, share: float, offse
     return generator.standard_normal(shape) + offset * side
 
 
-def stable(generator: np.random.Generator, shape: Shape, *, stability: float, skewness: float = 0.0) -> FloatArray:
+def stable(
+    generator: np.random.Generator, shape: Shape, *, stability: float, skewness: float = 0.0
+) -> FloatArray:
     """Return α-stable numbers S(α, β, 1/√2, 0; 1) by the method of Chambers, Mallows and Stuck.
 
     With V uniform in (−π/2, π/2), W exponential and θ = arctan(β tan(πα/2))/α:

@@ -27,17 +27,41 @@ from functools import cache, partial, wraps
 from itertools import pairwise
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import Annotated, Any, Final, Self, TypeAlias, TypeVar, cast, dataclass_transform, get_args, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Self,
+    TypeAlias,
+    TypeVar,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_type_hints,
+)
 
 import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le, Lt
-from pydantic import AllowInfNan, BeforeValidator, ConfigDict, PlainValidator, TypeAdapter, ValidationError
+from pydantic import (
+    AllowInfNan,
+    BeforeValidator,
+    ConfigDict,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.units import EXTENT, alternatives, in_own_unit, in_unit, split_quantity
+from servobench.plant.contract.units import (
+    EXTENT,
+    alternatives,
+    in_own_unit,
+    in_unit,
+    split_quantity,
+)
 
 
 @plain_dataclass(frozen=True)
@@ -88,7 +112,11 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - as read from a file
 
 def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
     parts = split_quantity(value) if isinstance(value, str) else (value, "")
-    number = parts[0] if parts is not None and parts[1] == ("px" if isinstance(value, str) else "") else None
+    number = (
+        parts[0]
+        if parts is not None and parts[1] == ("px" if isinstance(value, str) else "")
+        else None
+    )
     if not isinstance(number, int | float) or isinstance(number, bool) or not math.isfinite(number):
         raise PydanticCustomError("extent", "a number of metres or a text such as '2px'")
     if number < 0.0:
@@ -106,7 +134,9 @@ def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - as read from a
     return _as_numbers(value)
 
 
-Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(lambda name: (name,) if isinstance(name, str) else name)]
+Names: TypeAlias = Annotated[
+    tuple[str, ...], BeforeValidator(lambda name: (name,) if isinstance(name, str) else name)
+]
 """One name or several."""
 Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
 """An array of numbers; in a file, a number or a list of numbers."""
@@ -114,7 +144,9 @@ Values: TypeAlias = Annotated[npt.NDArray[Any], BeforeValidator(_as_values)]
 """An array of numbers, of truth values or of texts; in a file, one of them or a list."""
 Extent: TypeAlias = Annotated[NonNegative | str, PlainValidator(_as_extent)]
 """A number, 0 or above, or a text such as "2px"."""
-File: TypeAlias = Annotated[Path, BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)]
+File: TypeAlias = Annotated[
+    Path, BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
+]
 """The path of a file."""
 
 Class = TypeVar("Class", bound=type)
@@ -260,7 +292,11 @@ class Check:
 def _checks(kind: type) -> dict[str, Check]:
     """Return the check of each field that is not a section."""
     hints = get_type_hints(kind, include_extras=True)
-    return {item.name: Check.of(hints[item.name]) for item in fields(kind) if not is_dataclass(hints[item.name])}
+    return {
+        item.name: Check.of(hints[item.name])
+        for item in fields(kind)
+        if not is_dataclass(hints[item.name])
+    }
 
 
 @cache
@@ -276,7 +312,10 @@ def field_strings(kind: type[Any]) -> dict[str, str]:
     for each in reversed(kind.__mro__[:-1]):
         try:
             source = inspect.getsource(each)
-        except (OSError, TypeError):  # The class was typed in, is not written in Python, or came without its source.
+        except (
+            OSError,
+            TypeError,
+        ):  # The class was typed in, is not written in Python, or came without its source.
             strings |= _stored_strings().get(f"{each.__module__}.{each.__qualname__}", {})
             continue
         strings |= strings_in(ast.parse(textwrap.dedent(source)).body[0])
@@ -288,7 +327,9 @@ def strings_in(definition: ast.stmt) -> dict[str, str]:
     strings = {}
     for item, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
         match item, below:
-            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
+                value=ast.Constant(value=str(text))
+            ):
                 strings[name] = " ".join(text.split())
     return strings
 
@@ -305,7 +346,9 @@ def _stored_strings() -> dict[str, dict[str, str]]:
 
 def check_field(name: str, kind: type[Any], key: str, given: object) -> Any:  # noqa: ANN401 - any setting
     """Return the checked value of a field of a settings class, which is no section; see `read_value`."""
-    return read_value(name, given, _checks(cast(Any, kind))[key], partial(_unit, cast(Any, kind), key))
+    return read_value(
+        name, given, _checks(cast(Any, kind))[key], partial(_unit, cast(Any, kind), key)
+    )
 
 
 def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) -> Any:  # noqa: ANN401 - as checked
@@ -326,8 +369,12 @@ def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) 
     except ValidationError as error:
         raise ValueError(describe(error, name, written, unit(), bare=check.bare)) from None
     least, most = check.usual.least, check.usual.size
-    for number in [each for each in _numbers_in(value) if abs(each) > most or 0.0 < abs(each) < least][:1]:
-        meant = likely_meant(number, unit(), lambda other: least <= abs(other) <= most, bare=check.bare)
+    for number in [
+        each for each in _numbers_in(value) if abs(each) > most or 0.0 < abs(each) < least
+    ][:1]:
+        meant = likely_meant(
+            number, unit(), lambda other: least <= abs(other) <= most, bare=check.bare
+        )
         bound = f"at most {most:g}" if abs(number) > most else f"at least {least:g}"
         remark(f"{name} is {number:g}, and usually {f'{bound} {unit()}'.removesuffix(' 1')}{meant}")
     return value
@@ -373,10 +420,16 @@ def _numbers_in(value: object) -> Iterator[float]:
         yield value
 
 
-def likely_meant(number: float, unit: str, fits: Callable[[float], bool], *, bare: bool = False) -> str:
+def likely_meant(
+    number: float, unit: str, fits: Callable[[float], bool], *, bare: bool = False
+) -> str:
     """Return the remedy for a plain number that may have been meant in another unit, such as millimetres."""
     meant = {text: f"{value:.6g}" for text, value in alternatives(number, unit) if fits(value)}
-    wanted = f"{' or '.join(meant.values())}, as units cannot be written here" if bare else "the unit, too"
+    wanted = (
+        f"{' or '.join(meant.values())}, as units cannot be written here"
+        if bare
+        else "the unit, too"
+    )
     return f"; if {' or '.join(meant)} is meant, write {wanted}" if meant else ""
 
 
@@ -386,7 +439,12 @@ def native(value: Any) -> Any:  # noqa: ANN401 - anything that a user gave
 
 
 def describe(
-    error: ValidationError, name: str = "", written: object = None, unit: str = "", *, bare: bool = False
+    error: ValidationError,
+    name: str = "",
+    written: object = None,
+    unit: str = "",
+    *,
+    bare: bool = False,
 ) -> str:
     """Return the first complaint of pydantic as one line: field, wanted and given value.
 

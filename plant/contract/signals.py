@@ -13,7 +13,13 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array, check_number, is_finite, real_numbers
+from servobench.plant.contract.checks import (
+    FloatArray,
+    as_array,
+    check_number,
+    is_finite,
+    real_numbers,
+)
 
 BoolArray = npt.NDArray[np.bool_]
 JOINT_UNIT = "rad"
@@ -49,11 +55,15 @@ class Channel:
         for name in ("lower", "upper"):
             bound = np.array(getattr(self, name), dtype=np.float64)
             if bound.shape != (len(self.names),) or np.isnan(bound).any():
-                raise ValueError(f"{name} must hold {len(self.names)} numbers, got {bound.tolist()}")
+                raise ValueError(
+                    f"{name} must hold {len(self.names)} numbers, got {bound.tolist()}"
+                )
             bound.flags.writeable = False
             object.__setattr__(self, name, bound)
         if len(set(self.names)) < len(self.names):
-            raise ValueError(f"each joint and feature needs a name of its own, got {', '.join(self.names)}")
+            raise ValueError(
+                f"each joint and feature needs a name of its own, got {', '.join(self.names)}"
+            )
         if not (self.lower < self.upper).all():
             raise ValueError(f"lower must be below upper for every one of {', '.join(self.names)}")
 
@@ -84,13 +94,17 @@ class PlantSpec:
     def __post_init__(self) -> None:
         """Check sizes and signs."""
         if {type(self.feature), type(self.command)} != {Channel}:
-            raise ValueError(f"feature and command must be Channels, got {self.feature!r} and {self.command!r}")
+            raise ValueError(
+                f"feature and command must be Channels, got {self.feature!r} and {self.command!r}"
+            )
         for name in ("joint_lower", "joint_upper"):
             object.__setattr__(self, name, as_array(name, getattr(self, name), (self.n,)))
         if not (self.joint_lower < self.joint_upper).all():
             raise ValueError("joint_lower must be below joint_upper for every joint")
         if not (self.command.lower == -self.command.upper).all():
-            raise ValueError(f"command limits must be symmetric, got {self.command.lower} and {self.command.upper}")
+            raise ValueError(
+                f"command limits must be symmetric, got {self.command.lower} and {self.command.upper}"
+            )
         check_number("period", self.period, above=0.0)
 
     @classmethod
@@ -181,7 +195,11 @@ class Observation:
             value = getattr(self, name)
             object.__setattr__(self, name, as_array(name, value, (np.size(value),)))
         given = len(self.valid) > 0
-        valid = np.array(self.valid, dtype=np.bool_) if given else np.full(len(self.feature), self.feature_valid)
+        valid = (
+            np.array(self.valid, dtype=np.bool_)
+            if given
+            else np.full(len(self.feature), self.feature_valid)
+        )
         if valid.shape != self.feature.shape:
             raise ValueError(f"valid must have shape {self.feature.shape}, got {valid.shape}")
         valid.flags.writeable = False
@@ -190,7 +208,9 @@ class Observation:
 
     def with_values(self, joint_position: FloatArray, feature: FloatArray) -> Observation:
         """Return this observation with other joint positions and another feature, which are finite."""
-        return trusted_observation(self.time, joint_position, feature, self.feature_valid, self.valid)
+        return trusted_observation(
+            self.time, joint_position, feature, self.feature_valid, self.valid
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +248,11 @@ class Truth:
 
 
 def trusted_observation(
-    time: float, joints: FloatArray, feature: FloatArray, feature_valid: bool | BoolArray, valid: BoolArray
+    time: float,
+    joints: FloatArray,
+    feature: FloatArray,
+    feature_valid: bool | BoolArray,
+    valid: BoolArray,
 ) -> Observation:
     """Return an observation of arrays that are known to be fresh, finite, float64 and read-only.
 
@@ -246,7 +270,8 @@ def trusted_observation(
 
 _new = object.__new__
 _set_time, _set_joints, _set_feature, _set_feature_valid, _set_valid = (
-    getattr(Observation, name).__set__ for name in ("time", "joint_position", "feature", "feature_valid", "valid")
+    getattr(Observation, name).__set__
+    for name in ("time", "joint_position", "feature", "feature_valid", "valid")
 )
 
 
@@ -255,7 +280,10 @@ def column_names(spec: PlantSpec) -> dict[str, list[str]]:
     features, joints = (spec.feature_names, spec.feature_unit), (spec.joint_names, JOINT_UNIT)
     kinds = {"reference": features, "feature": features, "true_feature": features, "joint_position": joints,
              COMMAND: (spec.joint_names, spec.command.unit)}  # fmt: skip
-    return {kind: [f"{kind}_{name}_{column_unit(unit)}" for name in names] for kind, (names, unit) in kinds.items()}
+    return {
+        kind: [f"{kind}_{name}_{column_unit(unit)}" for name in names]
+        for kind, (names, unit) in kinds.items()
+    }
 
 
 def column_unit(unit: str) -> str:

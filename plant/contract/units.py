@@ -10,7 +10,9 @@ from typing import Final
 
 DEGREES: Final = 180.0 / math.pi
 EXTENT: Final = "m or px"  # own unit of lengths that are pixels where features are pixels
-UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # own unit -> unit -> how many of it are one of the own unit
+UNITS: Final[
+    Mapping[str, Mapping[str, float]]
+] = {  # own unit -> unit -> how many of it are one of the own unit
     "s": {"s": 1.0, "ms": 1e3, "us": 1e6, "min": 1.0 / 60.0},
     "m": {"m": 1.0, "cm": 1e2, "mm": 1e3},
     EXTENT: {"m": 1.0, "cm": 1e2, "mm": 1e3, "px": 1.0},
@@ -68,8 +70,14 @@ def alternatives(number: float, own: str) -> list[tuple[str, float]]:
     100 of centimetres.
     """
     unlikely = ("us",) if abs(number) < 100.0 else ("us", "cm")
-    smaller = [unit for unit, per in UNITS.get(own, {}).items() if per > 1.0 and unit not in unlikely]
+    smaller = [
+        unit for unit, per in UNITS.get(own, {}).items() if per > 1.0 and unit not in unlikely
+    ]
     rates = [rate for rate, unit in RATES.items() if unit == own]
     if abs(number) < 1.0 or (own == "1" and number < 0.0):  # a share
         return []
-    return [(f"{number:g}{unit}", in_own_unit(number, unit, own)) for unit in (*smaller, *rates) if "^" not in unit]
+    return [
+        (f"{number:g}{unit}", in_own_unit(number, unit, own))
+        for unit in (*smaller, *rates)
+        if "^" not in unit
+    ]

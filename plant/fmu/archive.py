@@ -21,7 +21,9 @@ DESCRIPTION: Final = "modelDescription.xml"
 MAX_FILES: Final = 20_000  # number of files in an archive
 MAX_UNPACKED: Final = 2_000_000_000  # [bytes] of all files together
 MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which is read into memory
-MAX_RATIO: Final = 100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
+MAX_RATIO: Final = (
+    100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
+)
 SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
 USUAL_ENCODING: Final = "cp437"  # in which Python's reader takes names without a mark
 UTF8_MARK: Final = 0x800
@@ -42,7 +44,9 @@ def extract_fmu(path: Path) -> Path:
     """
     with accessing(path, "fmu file", "read"):
         if not path.is_file():
-            raise ValueError(f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}")
+            raise ValueError(
+                f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}"
+            )
         key = digest(path)[:32]
     return cached(EXTRACTED, key, lambda folder: _extract(path, folder))
 
@@ -62,7 +66,9 @@ def _extract(path: Path, folder: Path) -> None:
             except DAMAGES as error:
                 if isinstance(error, OSError) and error.errno in DISK:
                     raise
-                raise ValueError(f"fmu file {path} cannot be extracted: {entry.filename!r}: {error}") from error
+                raise ValueError(
+                    f"fmu file {path} cannot be extracted: {entry.filename!r}: {error}"
+                ) from error
 
 
 def _place_of(entry: zipfile.ZipInfo) -> str:
@@ -81,7 +87,9 @@ def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
         parts = PurePosixPath(entry.filename)
         if ":" in entry.filename or parts.is_absolute() or ".." in parts.parts:
             name = repr(entry.orig_filename)
-            raise ValueError(f"fmu file {path} holds {name}, which would climb out of the folder it is extracted to")
+            raise ValueError(
+                f"fmu file {path} holds {name}, which would climb out of the folder it is extracted to"
+            )
     if len(places) < len(written):
         raise ValueError(f"fmu file {path} holds a file twice, with '/' and with '\\' in its name")
     if DESCRIPTION not in places:
@@ -91,7 +99,9 @@ def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
 def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     """Refuse an archive that would fill the disk or the memory."""
     if len(entries) > MAX_FILES:
-        raise ValueError(f"fmu file {path} holds {len(entries)} files; at most {MAX_FILES} are unpacked")
+        raise ValueError(
+            f"fmu file {path} holds {len(entries)} files; at most {MAX_FILES} are unpacked"
+        )
     description = max(entry.file_size for entry in entries if entry.filename == DESCRIPTION)
     if description > MAX_DESCRIPTION:
         raise ValueError(

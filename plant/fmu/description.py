@@ -24,7 +24,11 @@ REAL_TYPES: Final = ("Real", "Float64", "Float32")
 NUMERIC: Final = (*REAL_TYPES, "Integer", "Boolean", "Int32")
 MAX_NUMBERS: Final = 1_000_000  # largest size of a variable
 BASES: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")  # whose exponents define a unit
-SI_UNITS: Final = {(0, 1, 0, 0, 0, 0, 0, 0): "m", (0,) * 7 + (1,): "rad", (0, 0, -1, 0, 0, 0, 0, 1): "rad/s"}
+SI_UNITS: Final = {
+    (0, 1, 0, 0, 0, 0, 0, 0): "m",
+    (0,) * 7 + (1,): "rad",
+    (0, 0, -1, 0, 0, 0, 0, 1): "rad/s",
+}
 # A file name without folders; the standard wants an identifier of C.
 IDENTIFIER: Final = re.compile(r"(?!\.)[\w.+ -]{1,200}")
 
@@ -45,7 +49,9 @@ class Variable:
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""
-        return [self.name] if self.size == 1 else [f"{self.name}[{i + 1}]" for i in range(self.size)]
+        return (
+            [self.name] if self.size == 1 else [f"{self.name}[{i + 1}]" for i in range(self.size)]
+        )
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,9 @@ class FmuDescription:
     exchange: bool = False  # it offers model exchange only and has to be integrated by a solver
     n_states: int = 0  # number of continuous states
     n_indicators: int = 0  # number of event indicators
-    internal_step: float | None = None  # its own fixed step size, s, of which steps must be multiples; None for none
+    internal_step: float | None = (
+        None  # its own fixed step size, s, of which steps must be multiples; None for none
+    )
     usual_step: float | None = None  # that of its default experiment, s; None for none
     start_time: float = 0.0  # that of its default experiment, s; NaN for one that is no number
 
@@ -82,9 +90,14 @@ class FmuDescription:
             if match is not None:
                 index = tuple(int(part) for part in match[2].split(","))
                 families.setdefault(match[1] + match[3], []).append((index, variable))
-        return {name: [member for _, member in sorted(pairs, key=itemgetter(0))] for name, pairs in families.items()}
+        return {
+            name: [member for _, member in sorted(pairs, key=itemgetter(0))]
+            for name, pairs in families.items()
+        }
 
-    def find(self, name: str, role: str, types: Container[str] | None = REAL_TYPES) -> list[Variable]:
+    def find(
+        self, name: str, role: str, types: Container[str] | None = REAL_TYPES
+    ) -> list[Variable]:
         """Return the variables that `name` stands for.
 
         Args:
@@ -97,13 +110,22 @@ class FmuDescription:
         """
         found = [self._by_name[name]] if name in self._by_name else self._families.get(name)
         if found is None:
-            known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
-            raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}")
+            known = [
+                *self._families,
+                *(each.name for each in self.variables if "[" not in each.name),
+            ]
+            raise ValueError(
+                f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}"
+            )
         for variable in found:
             if not variable.settable and role.startswith(("parameters", "home", "camera")):
-                raise ValueError(f"{role} names {name!r}, which takes no value; wanted a parameter or a start value")
+                raise ValueError(
+                    f"{role} names {name!r}, which takes no value; wanted a parameter or a start value"
+                )
             if types is not None and variable.type not in types:
-                raise ValueError(f"{role} names {name!r}, which is of type {variable.type}; wanted a real variable")
+                raise ValueError(
+                    f"{role} names {name!r}, which is of type {variable.type}; wanted a real variable"
+                )
         return found
 
     def select(
@@ -146,7 +168,9 @@ def read_description(path: Path, root: Path) -> FmuDescription:
     version = str(description.fmiVersion)
     interface = description.coSimulation or description.modelExchange
     if interface is None:
-        raise ValueError(f"fmu file {path} offers scheduled execution only; wanted co-simulation or model exchange")
+        raise ValueError(
+            f"fmu file {path} offers scheduled execution only; wanted co-simulation or model exchange"
+        )
     identifier = str(interface.modelIdentifier)
     if not IDENTIFIER.fullmatch(identifier):
         raise ValueError(
@@ -231,7 +255,12 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
 
     try:
         version = ET.parse(root / DESCRIPTION).getroot().get("fmiVersion", "none")
-    except (ET.ParseError, LookupError, ValueError, OSError) as error:  # LookupError: an unknown encoding
+    except (
+        ET.ParseError,
+        LookupError,
+        ValueError,
+        OSError,
+    ) as error:  # LookupError: an unknown encoding
         raise ValueError(f"fmu file {path} has a broken {DESCRIPTION}: {_line(error)}") from error
     if not version.startswith(("2.", "3.")):
         raise ValueError(f"fmu file {path} is of FMI {_line(version)}; wanted FMI 2 or 3")
@@ -251,11 +280,17 @@ def _unit(variable: Any, units: Mapping[str, Any]) -> str:  # noqa: ANN401 - as 
     kind = variable.declaredType
     name = variable.unit or getattr(kind, "unit", None) or ""
     base: Any = units.get(name)
-    relative = getattr(kind if variable.relativeQuantity is None else variable, "relativeQuantity", False)
+    relative = getattr(
+        kind if variable.relativeQuantity is None else variable, "relativeQuantity", False
+    )
     own = None if base is None else SI_UNITS.get(tuple(getattr(base, each) for each in BASES))
     if own is None:
         return str(name)
-    usual = [each for each, per in UNITS[own].items() if math.isclose(base.factor * per, 1.0, rel_tol=1e-3)]
+    usual = [
+        each
+        for each, per in UNITS[own].items()
+        if math.isclose(base.factor * per, 1.0, rel_tol=1e-3)
+    ]
     shift = f"{base.offset:g} + " if base.offset and not relative else ""  # a difference has none
     return f"{shift}{base.factor:g} × {own}" if shift or not usual else usual[0]
 
@@ -273,7 +308,9 @@ def _variable(variable: Any, path: Path, units: Mapping[str, Any]) -> Variable: 
         raise _bad_size(variable, path, size)
     kind, settable = variable.causality or "local", variable.variability != "constant"
     settable = settable and variable.initial != "calculated"
-    return Variable(name, reference, size, kind, variable.type, axes, _unit(variable, units), settable)
+    return Variable(
+        name, reference, size, kind, variable.type, axes, _unit(variable, units), settable
+    )
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above
@@ -281,7 +318,9 @@ def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa
     named = dimension.start is None
     start = getattr(dimension.variable, "start", None) if named else dimension.start
     if start is None:
-        raise ValueError(f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value")
+        raise ValueError(
+            f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value"
+        )
     try:
         size = int(start)
     except (TypeError, ValueError):

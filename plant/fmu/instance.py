@@ -28,7 +28,8 @@ from servobench.plant.fmu.library import Library, MessageLog
 from servobench.plant.fmu.release import release
 
 Call: TypeAlias = Callable[[], None]
-Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # type of a variable -> word in the names of functions, type in memory
+# Type of a variable -> word in the names of functions, type in memory
+Kinds: TypeAlias = Mapping[str, tuple[str, Any]]
 RawCall: TypeAlias = Callable[[], int]  # The caller has to check the returned status.
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
 MIN_PROGRESS = 1e-9  # least share of a step for a partial step
@@ -74,16 +75,24 @@ class Instance(ABC):
     """One instance of an FMU."""
 
     prefix: ClassVar[str]  # of the names of all functions in the library
-    real: ClassVar[str]  # word for real numbers in the names of the functions that read and write them
+    real: ClassVar[
+        str
+    ]  # word for real numbers in the names of the functions that read and write them
     kinds: ClassVar[Kinds]  # the same word for each numeric type, and how its numbers lie in memory
     state: ClassVar[str]  # word for states in the names of their functions
     deserialise: ClassVar[str]  # the verb of the function that reads a state from bytes
     early: ClassVar[str]  # word for a step that ended early
     derivatives: ClassVar[str]  # name of the function that reads the states' derivatives
 
-    def __init__(self, description: FmuDescription, tolerance: float | None, debug_log: Path | None) -> None:
+    def __init__(
+        self, description: FmuDescription, tolerance: float | None, debug_log: Path | None
+    ) -> None:
         """Make an instance; see `open_instance`."""
-        self.description, self.tolerance, self._debugs = description, tolerance, debug_log is not None
+        self.description, self.tolerance, self._debugs = (
+            description,
+            tolerance,
+            debug_log is not None,
+        )
         self.log = MessageLog(description.path.name, debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
         self.library = Library(description)
@@ -172,7 +181,9 @@ class Instance(ABC):
         call = self.step_call(now, rest)
         while reached is not None:
             if not reached > time + least:
-                raise self.log.failure(f"{self.prefix}DoStep", f"{self.early} at {reached:.6g} s, no further")
+                raise self.log.failure(
+                    f"{self.prefix}DoStep", f"{self.early} at {reached:.6g} s, no further"
+                )
             if reached > end - least:
                 return
             time = now.value = reached
@@ -192,18 +203,24 @@ class Instance(ABC):
         """Return a function that reads or writes the port's variables by a row of its buffer, for the inner loop."""
         if all(self.kinds[variable.type] == self.kinds[self.real] for variable in port.members):
             place = self._buffer(port.pointer(row), port.values.shape[-1])
-            return partial(self.function(f"{verb}{self.real}"), self._component, *port.variables, *place)
+            return partial(
+                self.function(f"{verb}{self.real}"), self._component, *port.variables, *place
+            )
         values = port.values.reshape(-1, port.values.shape[-1])[row]
         parts = np.split(values, np.cumsum([variable.size for variable in port.members])[:-1])
         calls = [self._converted(verb, *each) for each in zip(port.members, parts, strict=True)]
         return lambda: max(call() for call in calls)
 
-    def _converted(self, verb: Literal["Get", "Set"], variable: Variable, values: FloatArray) -> RawCall:
+    def _converted(
+        self, verb: Literal["Get", "Set"], variable: Variable, values: FloatArray
+    ) -> RawCall:
         """Return a function that reads or writes one variable of any numeric type by `values`."""
         word, kind = self.kinds[variable.type]
         buffer: npt.NDArray[Any] = np.zeros(variable.size, dtype=kind)
         place = self._buffer(ctypes.c_void_p(buffer.ctypes.data), variable.size)
-        call = partial(self.function(f"{verb}{word}"), self._component, *Port([variable]).variables, *place)
+        call = partial(
+            self.function(f"{verb}{word}"), self._component, *Port([variable]).variables, *place
+        )
 
         def convert() -> int:
             if verb == "Set":
@@ -283,7 +300,12 @@ class Instance(ABC):
     def restore_bytes(self, content: bytes) -> None:
         """Return to a state from `save_bytes`."""
         state = ctypes.c_void_p()
-        self.call(f"{self.deserialise}{self.state}", content, ctypes.c_size_t(len(content)), ctypes.byref(state))
+        self.call(
+            f"{self.deserialise}{self.state}",
+            content,
+            ctypes.c_size_t(len(content)),
+            ctypes.byref(state),
+        )
         try:
             self.restore(state)
         finally:
@@ -327,7 +349,9 @@ class Instance(ABC):
     def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - types of C
         """Call a function of the library on the instance and check its status; not for the inner loop."""
         if self.library.condemned:
-            raise FmuError(f"{self.description.path.name} reported a fatal error before, so it cannot be called again")
+            raise FmuError(
+                f"{self.description.path.name} reported a fatal error before, so it cannot be called again"
+            )
         self.check(f"{self.prefix}{name}", self.function(name)(self._component, *arguments))
 
     def function(self, name: str) -> Any:  # noqa: ANN401 - a ctypes function
@@ -362,7 +386,9 @@ class Integrator:
         self._begin(time)
         while time < end:
             reached = self._solve(time, min(end, event_time))
-            time = end if math.isclose(reached[1], end, rel_tol=1e-14, abs_tol=1e-14) else reached[1]
+            time = (
+                end if math.isclose(reached[1], end, rel_tol=1e-14, abs_tol=1e-14) else reached[1]
+            )
             self._instance.call("SetTime", ctypes.c_double(time))
             if (reached[0] or self._asks_for_event() or time >= event_time) and time < end:
                 self._instance.call("EnterEventMode")
@@ -375,15 +401,21 @@ class Integrator:
         for _ in range(MAX_EVENT_ITERATIONS):
             again, ends, following = self._instance.update_discrete_states()
             if ends:
-                raise FmuError(f"{self._instance.description.path.name} asked to end the simulation")
+                raise FmuError(
+                    f"{self._instance.description.path.name} asked to end the simulation"
+                )
             if not again:
                 self._instance.call("EnterContinuousTimeMode")
                 return following
-        raise FmuError(f"{self._instance.description.path.name}: discrete states do not settle at an event")
+        raise FmuError(
+            f"{self._instance.description.path.name}: discrete states do not settle at an event"
+        )
 
     def _asks_for_event(self) -> bool:
         enter, ends = ctypes.c_int(), ctypes.c_int()
-        self._instance.call("CompletedIntegratorStep", ctypes.c_int(1), ctypes.byref(enter), ctypes.byref(ends))
+        self._instance.call(
+            "CompletedIntegratorStep", ctypes.c_int(1), ctypes.byref(enter), ctypes.byref(ends)
+        )
         if ends.value:
             raise FmuError(f"{self._instance.description.path.name} asked to end the simulation")
         return bool(enter.value)
@@ -403,7 +435,9 @@ class Integrator:
         except RuntimeError as error:
             self._raise_fault()
             words = " ".join(str(error).split())
-            raise FmuError(f"{self._instance.description.path.name} cannot be integrated: {words}") from error
+            raise FmuError(
+                f"{self._instance.description.path.name} cannot be integrated: {words}"
+            ) from error
         self._raise_fault()
         return bool(event), float(reached)
 
@@ -416,7 +450,9 @@ class Integrator:
             from fmpy.sundials import CVodeSolver  # noqa: PLC0415 - a library that not every platform has
         except OSError as error:
             name = self._instance.description.path.name
-            raise FmuError(f"{name} offers model exchange only, and fmpy has no solver for this machine") from error
+            raise FmuError(
+                f"{name} offers model exchange only, and fmpy has no solver for this machine"
+            ) from error
         description = self._instance.description
         return CVodeSolver(
             nx=description.n_states,
@@ -426,15 +462,21 @@ class Integrator:
             get_dx=self._vector(self._instance.derivatives),
             get_z=self._vector("GetEventIndicators"),
             get_nominals=self._vector("GetNominalsOfContinuousStates"),
-            set_time=self._guarded(lambda now: self._instance.call("SetTime", ctypes.c_double(now))),
-            input=SimpleNamespace(apply=lambda _time: None),  # Inputs stay as they are within a step.
+            set_time=self._guarded(
+                lambda now: self._instance.call("SetTime", ctypes.c_double(now))
+            ),
+            input=SimpleNamespace(
+                apply=lambda _time: None
+            ),  # Inputs stay as they are within a step.
             startTime=time,
             relativeTolerance=self._instance.tolerance or RELATIVE_TOLERANCE,
             maxNumSteps=MAX_SOLVER_STEPS,
         )
 
     def _vector(self, name: str) -> Callable[..., None]:
-        return self._guarded(lambda values, size: self._instance.call(name, values, ctypes.c_size_t(size)))
+        return self._guarded(
+            lambda values, size: self._instance.call(name, values, ctypes.c_size_t(size))
+        )
 
     def _guarded(self, act: Callable[..., None]) -> Callable[..., None]:
         """Return a callback for C that stores the first exception in place of raising it."""

@@ -25,7 +25,9 @@ from servobench.plant.fmu.library import MessageLog, plain_root
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 LAST_SUCCESSFUL_TIME = 2
 # Whole numbers of FMI 3 -> their type in memory.
-WHOLE_TYPES: Final = {f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)}
+WHOLE_TYPES: Final = {
+    f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,9 @@ class Instances:
         self.lanes: list[Lane] = []
         self.live: list[Lane] = []
 
-    def open(self, count: int, make: Callable[[], Instance], connect: Callable[[Instance, int], Lane]) -> None:
+    def open(
+        self, count: int, make: Callable[[], Instance], connect: Callable[[Instance, int], Lane]
+    ) -> None:
         """Make `count` instances; `connect` makes the lane of an instance with the row of its buffers."""
         for row in range(count):
             instance = make()
@@ -128,12 +132,16 @@ def open_instance(
     return kind(description, tolerance, debug_log)
 
 
-_Logger = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
+_Logger = ctypes.CFUNCTYPE(
+    None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p
+)
 
 _logs: weakref.WeakValueDictionary[int, MessageLog] = weakref.WeakValueDictionary()
 
 
-def _log_message(environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes) -> None:
+def _log_message(
+    environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes
+) -> None:
     """Pass a message to the log of the instance that it came from; the environment identifies it."""
     log = _logs.get(environment or 0) or MessageLog("fmu")
     log.add(status, (message or b"").decode("utf-8", errors="replace"))
@@ -246,14 +254,22 @@ class Instance3(Instance):
 
     def _instantiate(self) -> int | None:
         log = self.log
-        self._end, self._early, self._last_time = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double()
+        self._end, self._early, self._last_time = (
+            ctypes.c_bool(),
+            ctypes.c_bool(),
+            ctypes.c_double(),
+        )
 
-        def on_message(_environment: int | None, status: int, _category: bytes, message: bytes) -> None:
+        def on_message(
+            _environment: int | None, status: int, _category: bytes, message: bytes
+        ) -> None:
             log.add(status, (message or b"").decode("utf-8", errors="replace"))
 
         self._on_message = LogMessage(on_message)
         exchange = self.description.exchange
-        create = self.function("InstantiateModelExchange" if exchange else "InstantiateCoSimulation")
+        create = self.function(
+            "InstantiateModelExchange" if exchange else "InstantiateCoSimulation"
+        )
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
         resources = plain_root(self.description.root) / "resources"
@@ -261,7 +277,9 @@ class Instance3(Instance):
         common = [*(name.encode() for name in names), no, ctypes.c_bool(self._debugs)]
         early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
         end = [null, self._on_message]
-        address: int | None = create(*common, *end) if exchange else create(*common, *early_return, *end, null)
+        address: int | None = (
+            create(*common, *end) if exchange else create(*common, *early_return, *end, null)
+        )
         return address
 
     def _initialise(self, time: float) -> None:
@@ -272,22 +290,30 @@ class Instance3(Instance):
 
     def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         end, early = self._end, self._early
-        results = [ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)]
-        call = partial(self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results)
+        results = [
+            ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)
+        ]
+        call = partial(
+            self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results
+        )
         return lambda: call() or (WARNING if end.value or early.value else OK)
 
     def update_discrete_states(self) -> tuple[bool, bool, float]:
         """See `Instance.update_discrete_states`."""
         again, ends, nominals, states, has_next = (ctypes.c_bool() for _ in range(5))
         following = ctypes.c_double()
-        results = [ctypes.byref(each) for each in (again, ends, nominals, states, has_next, following)]
+        results = [
+            ctypes.byref(each) for each in (again, ends, nominals, states, has_next, following)
+        ]
         self.call("UpdateDiscreteStates", *results)
         return again.value, ends.value, following.value if has_next.value else math.inf
 
     def _reached(self, status: int, time: float) -> float | None:
         self.check(f"at {time:.6g} s, fmi3DoStep", status)
         if self._end.value:
-            raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
+            raise FmuError(
+                f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s"
+            )
         return self._last_time.value if self._early.value else None
 
     def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:

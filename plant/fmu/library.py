@@ -16,7 +16,9 @@ from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.files import accessing
 from servobench.plant.fmu.description import FmuDescription
 
-NOEXEC_REMEDY: Final = "so no code is loaded from it: let TMPDIR and XDG_CACHE_HOME name folders elsewhere"
+NOEXEC_REMEDY: Final = (
+    "so no code is loaded from it: let TMPDIR and XDG_CACHE_HOME name folders elsewhere"
+)
 _fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
 
 
@@ -40,18 +42,30 @@ class Library:
             if file.is_file() and file.resolve().is_relative_to(root.resolve()):
                 try:
                     library = None if description.once_per_process else ctypes.CDLL(str(file))
-                    self.loaded = _load_copy(file) if library is None or library._handle in _fatal else library
+                    self.loaded = (
+                        _load_copy(file)
+                        if library is None or library._handle in _fatal
+                        else library
+                    )
                 except OSError as error:
                     remedy = ""
                     if forbids_code(file):
-                        remedy = f"; it lies on a file system that is mounted noexec, {NOEXEC_REMEDY}"
-                    what = f"the library in {description.path.name} cannot be loaded: {error}{remedy}"
+                        remedy = (
+                            f"; it lies on a file system that is mounted noexec, {NOEXEC_REMEDY}"
+                        )
+                    what = (
+                        f"the library in {description.path.name} cannot be loaded: {error}{remedy}"
+                    )
                     raise ValueError(what) from error
                 return
             if file.parent.is_dir():
                 there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
                 raise ValueError(f"{lacking} binaries/{folder}/{wanted}, it has there: {there}")
-        there = ", ".join(sorted(folder.name for folder in binaries.iterdir())) if binaries.is_dir() else ""
+        there = (
+            ", ".join(sorted(folder.name for folder in binaries.iterdir()))
+            if binaries.is_dir()
+            else ""
+        )
         raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there or 'none'}")
 
     @property
@@ -98,7 +112,14 @@ def plain_root(root: Path) -> Path:
 logger = logging.getLogger("servobench.fmu")
 
 STATUS_WORDS: Final = dict(enumerate(("ok", "warning", "discard", "error", "fatal", "pending")))
-STATUS_LEVELS: Final = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR, logging.ERROR, logging.DEBUG)
+STATUS_LEVELS: Final = (
+    logging.DEBUG,
+    logging.WARNING,
+    logging.WARNING,
+    logging.ERROR,
+    logging.ERROR,
+    logging.DEBUG,
+)
 REMEMBERED_MESSAGES: Final = 5
 
 

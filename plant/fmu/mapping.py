@@ -34,7 +34,13 @@ from servobench.plant.contract.settings import (
 )
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.contract.units import SPELLINGS, UNITS
-from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription, Variable, total_size
+from servobench.plant.fmu.description import (
+    NUMERIC,
+    REAL_TYPES,
+    FmuDescription,
+    Variable,
+    total_size,
+)
 from servobench.plant.fmu.library import logger
 
 Roles = TypeVar("Roles")
@@ -42,11 +48,16 @@ Roles = TypeVar("Roles")
 DECLARED: Final = {unit for units in UNITS.values() for unit in units if unit not in {"", "%"}} | {
     "um", "km", "mrad", "rev", "mrad/s", "rpm", "m/s", "mm/s", "rad/s2", "deg/s2", "m/s2", "N", "N.m", "A", "V",
 }  # fmt: skip
-REPEATED: Final = {"seen", "truth.jacobian", "jacobian"}  # outputs that may be named more than once, such as one flag
-STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
+# Outputs that may be named more than once, such as one flag
+REPEATED: Final = {"seen", "truth.jacobian", "jacobian"}
+STEP_TOLERANCE: Final = (
+    1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
+)
 WHOLE_TOLERANCE: Final = 1e-9  # [s] between a period and its steps
 MIN_DIGITS: Final = 4  # A step with fewer digits is exact.
-MAX_STEP_ERROR: Final = 1e-3  # relative error of a step from one instant of an FMU's clock to the next
+MAX_STEP_ERROR: Final = (
+    1e-3  # relative error of a step from one instant of an FMU's clock to the next
+)
 
 
 @settings
@@ -67,15 +78,21 @@ class JointLimits:
 
     max_joint_speed: Annotated[Numbers, Usual(20.0)] = field(default_factory=lambda: np.array(1.0))
     """[rad/s] commands are clipped to it."""
-    joint_lower: Annotated[Numbers, Usual(4 * np.pi)] = field(default_factory=lambda: np.array(-2 * np.pi))
+    joint_lower: Annotated[Numbers, Usual(4 * np.pi)] = field(
+        default_factory=lambda: np.array(-2 * np.pi)
+    )
     """[rad]"""
-    joint_upper: Annotated[Numbers, Usual(4 * np.pi)] = field(default_factory=lambda: np.array(2 * np.pi))
+    joint_upper: Annotated[Numbers, Usual(4 * np.pi)] = field(
+        default_factory=lambda: np.array(2 * np.pi)
+    )
     """[rad]"""
 
     def __post_init__(self) -> None:
         """Check the sign of the speeds."""
         if not (self.max_joint_speed > 0.0).all():
-            raise ValueError(f"max_joint_speed must be above 0, got {self.max_joint_speed.tolist()}")
+            raise ValueError(
+                f"max_joint_speed must be above 0, got {self.max_joint_speed.tolist()}"
+            )
 
     def of(self, name: str, n: int) -> FloatArray:
         """Return a limit of each of `n` joints, (n,).
@@ -143,9 +160,13 @@ class FmuMapping:
     def __post_init__(self) -> None:
         """Check that something takes the start."""
         if self.start is not None and self.joints and self.home is None:
-            raise ValueError("start needs home, the parameter that takes it: the FMU has joints of its own")
+            raise ValueError(
+                "start needs home, the parameter that takes it: the FMU has joints of its own"
+            )
         if self.home in self.parameters:
-            raise ValueError(f"home and parameters name {self.home!r}, the joints at the start: write start instead")
+            raise ValueError(
+                f"home and parameters name {self.home!r}, the joints at the start: write start instead"
+            )
 
 
 def read_mapping(kind: type[Roles], path: Path) -> Roles:
@@ -159,7 +180,11 @@ def read_mapping(kind: type[Roles], path: Path) -> Roles:
         ValueError: an unreadable or malformed file, a missing or unknown key, or a value of the wrong kind.
     """
     table = read_toml("mapping", path)
-    needed = [each.name for each in fields(cast(Any, kind)) if each.default is each.default_factory is MISSING]
+    needed = [
+        each.name
+        for each in fields(cast(Any, kind))
+        if each.default is each.default_factory is MISSING
+    ]
     for key in needed:
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
@@ -183,7 +208,10 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
             f"{description.path.name} takes steps of multiples of {own!r} s only (fixedInternalStepSize), so period "
             f"must be one, got {step!r} s"
         )
-    n, m = (total_size(description.select(getattr(mapping, role), role)) for role in ("inputs", "features"))
+    n, m = (
+        total_size(description.select(getattr(mapping, role), role))
+        for role in ("inputs", "features")
+    )
     if not (n and m):
         raise ValueError(f"inputs and features must name at least one number each, got {n} and {m}")
     truth, camera, unit = mapping.truth, mapping.camera or (), mapping.names.feature_unit
@@ -200,43 +228,69 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("camera[2]", camera[1:], 3, "rad"),
     )
     types = {"seen": NUMERIC}
-    found = {role: description.select(names, role, types.get(role, REAL_TYPES)) for role, names, *_ in roles}
+    found = {
+        role: description.select(names, role, types.get(role, REAL_TYPES))
+        for role, names, *_ in roles
+    }
     again = ("truth.features", "truth.states")
-    check_roles({role: part for role, part in found.items() if role not in again}, ("inputs",), description)
+    check_roles(
+        {role: part for role, part in found.items() if role not in again}, ("inputs",), description
+    )
     values = description.select(mapping.parameters, "parameters", None)
     check_roles({"inputs": found["inputs"], "parameters": values}, (), description)
     declared = {variable.unit.translate(SPELLINGS): variable.name for variable in found["features"]}
     if (known := DECLARED & declared.keys()) and unit.translate(SPELLINGS) not in known:
-        raise ValueError(f"names.feature_unit must be {min(known)}, the unit of {declared[min(known)]}, got {unit}")
+        raise ValueError(
+            f"names.feature_unit must be {min(known)}, the unit of {declared[min(known)]}, got {unit}"
+        )
     for role, names, size, own_unit in roles:
-        check_unit(role, found[role], own_unit, any_quantity=role.endswith(("features", "jacobian")))
+        check_unit(
+            role, found[role], own_unit, any_quantity=role.endswith(("features", "jacobian"))
+        )
         if names and (came := total_size(found[role])) != size:
-            raise ValueError(f"{role} must name {size} numbers for {n} inputs and {m} features, got {came}")
-    joints, features = _labels("joint", mapping.names.joints, n), _labels("feature", mapping.names.features, m)
-    speed, lower, upper = (mapping.limits.of(name, n) for name in ("max_joint_speed", "joint_lower", "joint_upper"))
+            raise ValueError(
+                f"{role} must name {size} numbers for {n} inputs and {m} features, got {came}"
+            )
+    joints, features = (
+        _labels("joint", mapping.names.joints, n),
+        _labels("feature", mapping.names.features, m),
+    )
+    speed, lower, upper = (
+        mapping.limits.of(name, n) for name in ("max_joint_speed", "joint_lower", "joint_upper")
+    )
     return PlantSpec.of_joints(joints, features, speed, lower, upper, period, unit)
 
 
-def check_roles(roles: Mapping[str, Iterable[Variable]], inputs: Container[str], description: FmuDescription) -> None:
+def check_roles(
+    roles: Mapping[str, Iterable[Variable]], inputs: Container[str], description: FmuDescription
+) -> None:
     """Refuse variables by role that are named twice, or that are no inputs in the roles `inputs`.
 
     Raises:
         ValueError: names the variable.
     """
     taken: dict[str, str] = {}
-    for role, variable in ((role, variable) for role, variables in roles.items() for variable in variables):
+    for role, variable in (
+        (role, variable) for role, variables in roles.items() for variable in variables
+    ):
         if role in inputs and variable.causality != "input":
-            raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
+            raise ValueError(
+                f"{role} names {variable.name!r}, which is of causality {variable.causality}"
+            )
         other = taken.get(variable.name)
         if {other, role} == {"joints", "features"} and role not in inputs:
-            logger.warning("features name the joint %s; a camera measures other quantities", variable.name)
+            logger.warning(
+                "features name the joint %s; a camera measures other quantities", variable.name
+            )
         elif other is not None and (other != role or role in inputs or role not in REPEATED):
             how = "twice" if other == role else f"as {other} does; each has its own"
             raise ValueError(f"{description.path.name}: {role} names {variable.name!r} {how}")
         taken[variable.name] = role
 
 
-def check_unit(role: str, variables: Iterable[Variable], own: str, *, any_quantity: bool = False) -> None:
+def check_unit(
+    role: str, variables: Iterable[Variable], own: str, *, any_quantity: bool = False
+) -> None:
     """Refuse variables that the FMU declares in another unit of the same quantity, or of another one.
 
     Raises:
@@ -247,7 +301,9 @@ def check_unit(role: str, variables: Iterable[Variable], own: str, *, any_quanti
         same = unit in UNITS.get(wanted, {}) or unit.endswith(f" × {wanted}")  # quantity
         if (unit in DECLARED or " × " in unit) and unit != wanted and (same or not any_quantity):
             remedy = "convert it in the FMU" if same else "name another variable"
-            raise ValueError(f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: {remedy}")
+            raise ValueError(
+                f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: {remedy}"
+            )
 
 
 def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float) -> str:
@@ -288,7 +344,8 @@ def count_steps(period: float, written: float) -> int:
     _, digits, exponent = Decimal(repr(written)).as_tuple()
     last = 10.0 ** float(exponent)  # value of a one as the last digit
     is_near = abs(exact - written) <= STEP_TOLERANCE * exact
-    is_rounded = len(digits) >= MIN_DIGITS and -0.5 < (exact - written) / last < 1.0  # also where digits were cut off
+    # Also where digits were cut off
+    is_rounded = len(digits) >= MIN_DIGITS and -0.5 < (exact - written) / last < 1.0
     if is_near or (is_rounded and count * last < 0.1 * written):
         return count
     return 0

@@ -30,7 +30,11 @@ class FmuModel:
     """
 
     def __init__(
-        self, path: Path, joints: Sequence[str], features: Sequence[str], parameters: Mapping[str, float]
+        self,
+        path: Path,
+        joints: Sequence[str],
+        features: Sequence[str],
+        parameters: Mapping[str, float],
     ) -> None:
         """Load the FMU.
 
@@ -49,7 +53,9 @@ class FmuModel:
         q: Any = casadi.MX.sym("joint_position", self._feature.size1_in(0))
         y = self._feature(q)
         outputs = [y, casadi.jacobian(y, q)]
-        self.function = casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
+        self.function = casadi.Function(
+            "hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"]
+        )
 
     def symbolic(self, joint_position: Any) -> Any:  # noqa: ANN401 - CasADi expressions
         """Return the feature, (m, 1), as an expression of `joint_position`, an MX expression of shape (n, 1) in rad."""
@@ -63,7 +69,9 @@ class FmuModel:
 
 
 def build_model(
-    mapping: FmuMapping, description: FmuDescription, parameters: Mapping[str, FloatArray] | None = None
+    mapping: FmuMapping,
+    description: FmuDescription,
+    parameters: Mapping[str, FloatArray] | None = None,
 ) -> FmuModel:
     """Return the model of a mapped FMU.
 
@@ -77,29 +85,47 @@ def build_model(
     """
     states = mapping.truth.states or mapping.joints
     if not states:
-        raise ValueError("truth.states must name the states of the FMU that are the joint positions, got none")
+        raise ValueError(
+            "truth.states must name the states of the FMU that are the joint positions, got none"
+        )
     values: dict[str, float] = {}
     for name, value in {**mapping.parameters, **(parameters or {})}.items():
-        variables = description.find(name, "nominal" if parameters and name in parameters else "parameters", None)
+        variables = description.find(
+            name, "nominal" if parameters and name in parameters else "parameters", None
+        )
         if variables[0].type == "String":
-            raise ValueError(f"parameter {name!r} is a text, which CasADi cannot give to the FMU's model")
+            raise ValueError(
+                f"parameter {name!r} is a text, which CasADi cannot give to the FMU's model"
+            )
         if np.shape(value) not in ((), (len(variables),)):
-            raise ValueError(f"parameter {name!r} must have {len(variables)} values, got {np.size(value)}")
+            raise ValueError(
+                f"parameter {name!r} must have {len(variables)} values, got {np.size(value)}"
+            )
         scalars = np.broadcast_to(value, (len(variables),)).tolist()
-        values |= {variable.name: scalar for variable, scalar in zip(variables, scalars, strict=True)}
+        values |= {
+            variable.name: scalar for variable, scalar in zip(variables, scalars, strict=True)
+        }
     joints = description.select(states, "truth.states" if mapping.truth.states else "joints")
     features = description.select(mapping.truth.features or mapping.features, "features")
-    return FmuModel(mapping.file, [each.name for each in joints], [each.name for each in features], values)
+    return FmuModel(
+        mapping.file, [each.name for each in joints], [each.name for each in features], values
+    )
 
 
 def _feature_function(
-    path: Path, root: Path, joints: Sequence[str], features: Sequence[str], parameters: Mapping[str, float]
+    path: Path,
+    root: Path,
+    joints: Sequence[str],
+    features: Sequence[str],
+    parameters: Mapping[str, float],
 ) -> Any:  # noqa: ANN401 - a casadi.Function
     """Return q -> y with everything else at its start."""
     try:
         builder = casadi.DaeBuilder("fmu", str(root))
         states, constants, fixed = list(builder.x()), list(builder.p()), list(builder.c())
-        _check_names("parameters or nominal", parameters, [*constants, *fixed], f"parameters of {path.name}")
+        _check_names(
+            "parameters or nominal", parameters, [*constants, *fixed], f"parameters of {path.name}"
+        )
         _check_names("joints", joints, states, f"states of {path.name}")
         _check_names("features", features, list(builder.y()), f"outputs of {path.name}")
         for name in set(fixed).intersection(parameters):
@@ -108,7 +134,8 @@ def _feature_function(
         builder.set_y(list(features))
         whole = builder.create("fmu", ["x", "u", "p"], ["y"])
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1]  # The other lines name places in CasADi's code.
+        # The other lines name places in CasADi's code.
+        reason = str(error).strip().splitlines()[-1]
         raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
     q: Any = casadi.MX.sym("joint_position", len(joints))
     place = {name: i for i, name in enumerate(joints)}
@@ -129,4 +156,6 @@ def _check_names(role: str, names: Iterable[str], known: list[str], group: str) 
     for name in names:
         if name not in known:
             families = dict.fromkeys(each.partition("[")[0] for each in known)
-            raise ValueError(f"{role} names {name!r}, which is none of the {group}: {', '.join(families) or 'none'}")
+            raise ValueError(
+                f"{role} names {name!r}, which is none of the {group}: {', '.join(families) or 'none'}"
+            )

@@ -25,7 +25,14 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Delay, Names, nested, remark, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription, Variable, read_description, total_size
+from servobench.plant.fmu.description import (
+    NUMERIC,
+    REAL_TYPES,
+    FmuDescription,
+    Variable,
+    read_description,
+    total_size,
+)
 from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
@@ -46,7 +53,9 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 REHEARSED_STEPS: Final = 5  # periods of an arm at rest in which outputs of foreign FMUs may jump
 MIN_JUMP: Final = 1e-6  # [unit of the output]
-MAX_JUMP_RATIO: Final = 5.0  # [1] A change is a jump if it is so many times larger than those after it.
+MAX_JUMP_RATIO: Final = (
+    5.0  # [1] A change is a jump if it is so many times larger than those after it.
+)
 # Names in exported arms.
 ARM_JOINTS: Final = ("joint_velocity_command", "joint_position")
 ARM_FEATURES: Final = ("ball_position", "feature")
@@ -114,7 +123,9 @@ class FmuWorld(World):
         self._mapping, self.lag = mapping, lag
         self.description = description = read_sized(mapping.file, mapping.parameters)
         if description.needs_tool:
-            remark(f"{mapping.file.name} calls the tool that made it, which has to be installed here")
+            remark(
+                f"{mapping.file.name} calls the tool that made it, which has to be installed here"
+            )
         if model is None and (unusual := unusual_step(mapping, description, period)):
             logger.warning(unusual)
         self.spec = mapping_spec(mapping, description, period)
@@ -144,7 +155,9 @@ class FmuWorld(World):
         truth = mapping.truth
         self._has_joints = bool(mapping.joints)
         self._command = self._port("inputs", mapping.inputs)
-        self._result = self._port("joints, features and seen", (*mapping.joints, *mapping.features, *mapping.seen))
+        self._result = self._port(
+            "joints, features and seen", (*mapping.joints, *mapping.features, *mapping.seen)
+        )
         self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
         self._split = self.spec.n if mapping.joints else 0
         self._now = ctypes.c_double()
@@ -217,7 +230,9 @@ class FmuWorld(World):
 
     def _measure(self) -> None:
         """Read joints and feature; those of a lane that failed stay as they were."""
-        self._instances.check("reading", self._result, [lane.read() for lane in self._instances.live])
+        self._instances.check(
+            "reading", self._result, [lane.read() for lane in self._instances.live]
+        )
         values = np.array(self._result.values[self._rows])
         if self.faults or not is_finite(values):
             for i in np.flatnonzero(~np.isfinite(values).all(axis=-1)).tolist():
@@ -233,8 +248,14 @@ class FmuWorld(World):
             self._seen = values[..., self._split + self.spec.m :] > SEEN_ABOVE
 
     def _not_finite(self, values: FloatArray) -> FmuError:
-        bad = [label for label, value in zip(self._result.labels, values, strict=True) if not np.isfinite(value)]
-        return FmuError(f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}")
+        bad = [
+            label
+            for label, value in zip(self._result.labels, values, strict=True)
+            if not np.isfinite(value)
+        ]
+        return FmuError(
+            f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}"
+        )
 
     def see(self) -> FloatArray:
         """Return the FMU's features as read after the last step."""
@@ -265,7 +286,9 @@ class FmuWorld(World):
             first = int(np.argmax(changes[:, i] > MIN_JUMP))
             later = changes[first + 1 :, i].max(initial=0.0)
             if changes[first, i] > max(MIN_JUMP, MAX_JUMP_RATIO * later):
-                jumps.append(f"{self._result.labels[i]} (to {rows[first + 1][i]:.3g} in step {first + 1})")
+                jumps.append(
+                    f"{self._result.labels[i]} (to {rows[first + 1][i]:.3g} in step {first + 1})"
+                )
         if jumps:
             found = f"{self.description.path.name} returns 0 at the start for what then jumps though the arm rests"
             remedy = "let it compute its outputs in the initialisation, too, or map `seen`"
@@ -292,7 +315,9 @@ class FmuWorld(World):
 
     def truth(self) -> Truth:
         """Return the FMU's own feature and, if the mapping names it or its states, the Jacobian."""
-        self._instances.check("reading", self._truth, [lane.read_truth() for lane in self._instances.live])
+        self._instances.check(
+            "reading", self._truth, [lane.read_truth() for lane in self._instances.live]
+        )
         values, m, n = np.array(self._truth.values[self._rows]), self.spec.m, self.spec.n
         jacobian = None
         if values.shape[-1] > m:
@@ -322,7 +347,9 @@ class FmuWorld(World):
         self.faults = {place: self.faults[i] for place, i in enumerate(chosen) if i in self.faults}
         self.lead, self._rows = (len(chosen),), self._rows[lanes]
         arrays = self._start, self._joints, self._feature, self._integrated
-        self._start, self._joints, self._feature, self._integrated = (array[lanes] for array in arrays)
+        self._start, self._joints, self._feature, self._integrated = (
+            array[lanes] for array in arrays
+        )
         self._seen = None if self._seen is None else self._seen[lanes]
 
     def save(self) -> FmuState:
@@ -332,7 +359,9 @@ class FmuWorld(World):
             ValueError: the FMU cannot save its state.
         """
         if not self.description.can_save:
-            raise ValueError(f"{self.description.path.name} cannot save its state (canGetAndSetFMUstate is false)")
+            raise ValueError(
+                f"{self.description.path.name} cannot save its state (canGetAndSetFMUstate is false)"
+            )
         saved = tuple(lane.instance.save() for lane in self._instances.lanes)
         return FmuState(saved, self._k, self._integrated)
 
@@ -382,7 +411,9 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
     """
     kind, given = variables[0].type, np.asarray(value)
     if len({variable.type for variable in variables}) > 1:
-        raise ValueError(f"parameter {name!r} stands for variables of several types; name each by itself")
+        raise ValueError(
+            f"parameter {name!r} stands for variables of several types; name each by itself"
+        )
     came = given.tolist()
     if kind == "String":
         fits, wanted = given.dtype.kind == "U", "text"
@@ -391,7 +422,9 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
     elif kind in INTEGERS:
         bounds = np.iinfo(INTEGERS[kind])
         low, high = max(int(bounds.min), -EXACT), min(int(bounds.max), EXACT)
-        fits = given.dtype.kind == "f" and bool(((given == np.round(given)) & (given >= low) & (given <= high)).all())
+        fits = given.dtype.kind == "f" and bool(
+            ((given == np.round(given)) & (given >= low) & (given <= high)).all()
+        )
         wanted = f"a whole number from {low} to {high}"
     elif kind in REAL_TYPES:
         fits, wanted = given.dtype.kind == "f", "a number"
@@ -402,7 +435,9 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
 
 
 def setters(
-    description: FmuDescription, parameters: Mapping[str, npt.NDArray[Any]], lead: tuple[int, ...] = ()
+    description: FmuDescription,
+    parameters: Mapping[str, npt.NDArray[Any]],
+    lead: tuple[int, ...] = (),
 ) -> list[Setter]:
     """Return functions that give parameters their values in an instance, by the row of its run; sizes come first.
 
@@ -414,12 +449,17 @@ def setters(
     Raises:
         ValueError: a value of the wrong type or size.
     """
-    found = [(description.find(name, "parameters", None), name, value) for name, value in parameters.items()]
+    found = [
+        (description.find(name, "parameters", None), name, value)
+        for name, value in parameters.items()
+    ]
     sizes_first = sorted(found, key=lambda each: each[0][0].causality != STRUCTURAL)
     return [_setter(*each, lead) for each in sizes_first]
 
 
-def _setter(variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]) -> Setter:
+def _setter(
+    variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]
+) -> Setter:
     check_value(variables, name, value)
     size, given = total_size(variables), np.asarray(value)
     if given.shape not in ((), (size,), (*lead, size)):
@@ -457,7 +497,12 @@ def build_fmu(
     """
     start = mapping.start if setup.start is None else setup.start
     with configuration_errors("", FmuError):
-        return build_bench(lambda own: FmuWorld(mapping, start, own.period, lag, model), setup, command_delay, sensing)
+        return build_bench(
+            lambda own: FmuWorld(mapping, start, own.period, lag, model),
+            setup,
+            command_delay,
+            sensing,
+        )
 
 
 def fmu_entry(path: Path) -> PlantEntry:
@@ -493,7 +538,9 @@ def _exported_arm(path: Path) -> FmuMapping:
     features = [name for name in ARM_FEATURES if name in units]
     if not (features and {*ARM_JOINTS, "jacobian"} <= units.keys()):
         keys = "its file, inputs and features"
-        raise ValueError(f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names {keys}")
+        raise ValueError(
+            f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names {keys}"
+        )
     return FmuMapping(
         path,
         inputs=ARM_JOINTS[:1],

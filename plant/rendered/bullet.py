@@ -21,7 +21,15 @@ import numpy as np
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import Window, whole
 from servobench.plant.rendered.drives import Drives, DriveState, RigidBody
-from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Image, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.engine import (
+    MIN_OVERLAP,
+    Engine,
+    Image,
+    Machine,
+    Overlap,
+    Scene,
+    Simulation,
+)
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import arm_mechanics, boxes_urdf, room_boxes
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
@@ -29,7 +37,9 @@ from servobench.plant.robot.robot import GRAVITY
 
 BANNER = b"pybullet build time:"  # the beginning of the line
 STANDARD_ERROR = 2  # file descriptor
-CONTACT_DISTANCE = 8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
+CONTACT_DISTANCE = (
+    8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
+)
 
 
 @contextlib.contextmanager
@@ -59,7 +69,11 @@ with without_banner():
 
 def describe_renderer() -> str:
     """Return the engine that renders images, its version, and a note if its images arrive slowly."""
-    images = "" if pybullet.isNumpyEnabled() else ", built without numpy: images arrive as tuples, which is slower"
+    images = (
+        ""
+        if pybullet.isNumpyEnabled()
+        else ", built without numpy: images arrive as tuples, which is slower"
+    )
     return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
 
 
@@ -122,15 +136,21 @@ class BulletScene(Scene):
             ConnectionError: PyBullet opens no world, as too many are open.
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
+            raise ValueError(
+                "view needs a display, but the environment variable DISPLAY is not set"
+            )
         self._world = PhysicsWorld(pybullet.GUI if window else pybullet.DIRECT)
         try:
             self._arm = self._world.load(room.files())
             if window:
                 # The window shows the arm from the front right, without PyBullet's side panels.
                 client = self._world.client
-                pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
-                pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
+                pybullet.configureDebugVisualizer(
+                    pybullet.COV_ENABLE_GUI, 0, physicsClientId=client
+                )
+                pybullet.resetDebugVisualizerCamera(
+                    1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client
+                )
         except BaseException:
             self.close()
             raise
@@ -143,10 +163,14 @@ class BulletScene(Scene):
     def ball_position(self) -> FloatArray:
         """See `Scene.ball_position`; from the simulator's own link state."""
         client = self._world.client
-        state = pybullet.getLinkState(self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=client)
+        state = pybullet.getLinkState(
+            self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=client
+        )
         return np.array(state[4])
 
-    def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> Image:
         """See `Scene.render`; the projection is magnified so that the window fills the picture of TinyRenderer."""
         window = window or whole(camera)
         height, width = window.shape
@@ -202,12 +226,20 @@ class BulletSimulation(Simulation):
             pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self._world.client)
             loaded = arm_mechanics(arm, drives.payload, shapes=True, robot=robot)
             self._arm = self._load(loaded, pybullet.URDF_USE_SELF_COLLISION)
-            self._assumed = self._load(arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot))
+            self._assumed = self._load(
+                arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot)
+            )
             room = (*room_boxes(robot.workspace.scale), *machine.boxes)
             self._boxes = {self._load(boxes_urdf((box,))): box.name for box in room}
             start = machine.start.tolist()
-            inertia = np.array(pybullet.calculateMassMatrix(self._assumed, start, physicsClientId=self._world.client))
-            self._drives = Drives(drives, machine.lag, inertia, machine.stops, physics_step=machine.physics_step)
+            inertia = np.array(
+                pybullet.calculateMassMatrix(
+                    self._assumed, start, physicsClientId=self._world.client
+                )
+            )
+            self._drives = Drives(
+                drives, machine.lag, inertia, machine.stops, physics_step=machine.physics_step
+            )
         except BaseException:
             self.close()
             raise
@@ -234,7 +266,12 @@ class BulletSimulation(Simulation):
 
     def body(self, angle: FloatArray, speed: FloatArray) -> RigidBody:
         """Return inertia and torques at joint angles (n,) [rad] and speeds (n,) [rad/s]."""
-        theta, rest, client, torques = angle.tolist(), self._rest, self._world.client, pybullet.calculateInverseDynamics
+        theta, rest, client, torques = (
+            angle.tolist(),
+            self._rest,
+            self._world.client,
+            pybullet.calculateInverseDynamics,
+        )
         return RigidBody(
             np.array(pybullet.calculateMassMatrix(self._arm, theta, physicsClientId=client)),
             np.array(torques(self._arm, theta, speed.tolist(), rest, physicsClientId=client)),
@@ -248,7 +285,8 @@ class BulletSimulation(Simulation):
         pybullet.performCollisionDetection(physicsClientId=client)
         for point in pybullet.getContactPoints(bodyA=self._arm, physicsClientId=client):
             if point[CONTACT_DISTANCE] <= -MIN_OVERLAP:
-                link, other = (min(each, n - 1) + 1 for each in point[3:5])  # PyBullet counts the base as -1
+                # PyBullet counts the base as -1
+                link, other = (min(each, n - 1) + 1 for each in point[3:5])
                 yield Overlap(link, self._boxes.get(point[2], other))
 
     def close(self) -> None:

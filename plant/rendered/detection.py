@@ -36,7 +36,9 @@ INNER_COSINE = 0.4  # cosine of the angle between ray and surface normal below w
 OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
 OUTLIER_FLOOR = 0.002  # [m] a smaller deviation is no outlier
 MAX_RESIDUAL = 0.75  # RMS as a share of the radius beyond which the fit is implausible
-MAX_UNCERTAINTY = 0.2  # standard error as a share of the radius beyond which the fit is too uncertain
+MAX_UNCERTAINTY = (
+    0.2  # standard error as a share of the radius beyond which the fit is too uncertain
+)
 SELECTION_ITERATIONS = 3  # number of iterations that select the depths again
 MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
@@ -74,7 +76,9 @@ def find_patch(rgb: ByteArray) -> Patch | None:
     Returns:
         The patch, or None where there is none, it is too small, or the image's border cuts it.
     """
-    return largest_patch(np.asarray(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), *RED_RANGE), dtype=np.uint8))
+    return largest_patch(
+        np.asarray(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), *RED_RANGE), dtype=np.uint8)
+    )
 
 
 def largest_patch(mask: ByteArray) -> Patch | None:
@@ -92,12 +96,19 @@ def largest_patch(mask: ByteArray) -> Patch | None:
     # Only the box around all of the colour is searched. A full box holds one patch, and the search for parts is slow.
     coloured = mask[y : y + height, x : x + width] > 0
     if np.count_nonzero(coloured) < FULL_BOX * width * height:
-        _, labels, statistics, _ = cv2.connectedComponentsWithStats(coloured.astype(np.uint8), connectivity=8)
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(
+            coloured.astype(np.uint8), connectivity=8
+        )
         coloured = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
     rows, columns = np.nonzero(coloured)
     rows, columns = rows + y, columns + x
     image_height, image_width = mask.shape
-    cut = rows[0] == 0 or rows[-1] == image_height - 1 or columns.min() == 0 or columns.max() == image_width - 1
+    cut = (
+        rows[0] == 0
+        or rows[-1] == image_height - 1
+        or columns.min() == 0
+        or columns.max() == image_width - 1
+    )
     return None if cut or len(rows) < MIN_PIXELS else Patch(rows, columns)
 
 
@@ -116,7 +127,9 @@ def add_colour_noise(rgb: ByteArray, deviation: float, generator: np.random.Gene
     return noisy
 
 
-def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: float) -> Detection | None:
+def locate_ball(
+    patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: float
+) -> Detection | None:
     """Return the ball that makes a red patch.
 
     Args:
@@ -136,12 +149,16 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     if fit is None or not fit.centre[2] > radius:
         return None
     visible = len(depth) / disc_area(fit.centre, camera, radius)
-    plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
+    plausible = (
+        fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
+    )
     complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
     return fit if plausible and complete else None
 
 
-def find_ball(rgb: ByteArray, buffer: FloatArray, camera: PinholeCamera, radius: float) -> Detection | None:
+def find_ball(
+    rgb: ByteArray, buffer: FloatArray, camera: PinholeCamera, radius: float
+) -> Detection | None:
     """Return the ball in a rendered image without noise, or None where none is found.
 
     Args:
@@ -153,16 +170,22 @@ def find_ball(rgb: ByteArray, buffer: FloatArray, camera: PinholeCamera, radius:
     patch = find_patch(rgb)
     if patch is None:
         return None
-    return locate_ball(patch, camera.metric_depth(buffer[patch.rows, patch.columns]), camera, radius)
+    return locate_ball(
+        patch, camera.metric_depth(buffer[patch.rows, patch.columns]), camera, radius
+    )
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
     """Return the area, px², of the ellipse of a sphere at `centre` (3,) m, which is stretched off the optical axis."""
     nearest2 = centre[2] ** 2 - radius**2
-    return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
+    return float(
+        np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3)
+    )
 
 
-def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> Detection | None:
+def fit_sphere(
+    rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float
+) -> Detection | None:
     """Fit the centre of a sphere of known radius to depths along rays.
 
     Args:
@@ -194,7 +217,9 @@ def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: f
             break
     residual = math.sqrt(e @ e / len(e))
     # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.
-    return Detection(centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal))))
+    return Detection(
+        centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal)))
+    )
 
 
 def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
@@ -205,10 +230,14 @@ def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[Floa
     return (along - root) / length2, root
 
 
-def choose_depths(rays: FloatArray, depth: FloatArray, centre: FloatArray, radius: float) -> IntArray:
+def choose_depths(
+    rays: FloatArray, depth: FloatArray, centre: FloatArray, radius: float
+) -> IntArray:
     """Return the indices of the rays that meet the sphere well inside its silhouette and whose depth is no outlier."""
     t, root = first_hit(rays, centre, radius)
-    inner = np.flatnonzero(root >= INNER_COSINE * radius * np.sqrt(np.einsum("ij,ij->i", rays, rays)))
+    inner = np.flatnonzero(
+        root >= INNER_COSINE * radius * np.sqrt(np.einsum("ij,ij->i", rays, rays))
+    )
     if len(inner) == 0:
         return inner
     size = np.abs(depth[inner] - t[inner])
@@ -218,7 +247,9 @@ def choose_depths(rays: FloatArray, depth: FloatArray, centre: FloatArray, radiu
     return inner[size <= gate]
 
 
-def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeCamera, radius: float) -> ByteArray:
+def draw_detection(
+    rgb: ByteArray, detection: Detection | None, camera: PinholeCamera, radius: float
+) -> ByteArray:
     """Return a copy of an image with the detected ball's outline and centre drawn on it.
 
     Args:
@@ -235,7 +266,15 @@ def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeC
     centre = (round(u * 2**shift), round(v * 2**shift))
     size = camera.focal * radius / detection.centre[2]
     thickness = max(1, round(camera.height / 360))
-    cv2.circle(picture, centre, round((size + 1.5 * thickness) * 2**shift), OUTLINE, thickness, cv2.LINE_AA, shift)
+    cv2.circle(
+        picture,
+        centre,
+        round((size + 1.5 * thickness) * 2**shift),
+        OUTLINE,
+        thickness,
+        cv2.LINE_AA,
+        shift,
+    )
     arm = round(0.45 * size * 2**shift)
     for dx, dy in ((arm, 0), (0, arm)):
         ends = ((centre[0] - dx, centre[1] - dy), (centre[0] + dx, centre[1] + dy))
@@ -290,7 +329,10 @@ def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> W
         return None if z < -radius else whole(camera)
     depth2 = z * z - radius * radius
     sides = -radius, radius
-    ends = [[(at * z + side * math.sqrt(at * at + depth2)) / depth2 for at in (x, y)] + [1.0] for side in sides]
+    ends = [
+        [(at * z + side * math.sqrt(at * at + depth2)) / depth2 for at in (x, y)] + [1.0]
+        for side in sides
+    ]
     (left, top), (right, bottom) = camera.project(ends).tolist()
     window = Window(
         max(0, math.floor(top) - MARGIN),

@@ -49,15 +49,24 @@ from servobench.plant.rendered.detection import (
     window_around_all,
 )
 from servobench.plant.rendered.engine import Scene
-from servobench.plant.rendered.marks import MARK_COLOURS, Mark, disc_centre, find_marks, sphere_centre
+from servobench.plant.rendered.marks import (
+    MARK_COLOURS,
+    Mark,
+    disc_centre,
+    find_marks,
+    sphere_centre,
+)
 from servobench.plant.rendered.room import mark_radius
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.robot import Robot
 
-MAX_SIZE: Final = 1024  # [px] of an ideal image's side: a lens with a wider view is black at its edges
-NOWHERE: Final = (0.0, 0.0, 1.0)  # stands for a point that is not found, whose features are not valid
+MAX_SIZE: Final = (
+    1024  # [px] of an ideal image's side: a lens with a wider view is black at its edges
+)
+# Stands for a point that is not found, whose features are not valid
+NOWHERE: Final = (0.0, 0.0, 1.0)
 CROSS: Final = 5  # [px] half size of the cross that marks a point in a picture
 DEPTH, COLOUR = "depth_noise", "colour_noise"  # names of the random streams
 
@@ -128,7 +137,12 @@ class Lens:
         if ideal is None or self._map is None:
             return None if ideal is None else View(ideal, ideal)
         columns, rows = self._map
-        shown = (columns >= ideal.left) & (columns < ideal.right) & (rows >= ideal.top) & (rows < ideal.bottom)
+        shown = (
+            (columns >= ideal.left)
+            & (columns < ideal.right)
+            & (rows >= ideal.top)
+            & (rows < ideal.bottom)
+        )
         left, top, width, height = cv2.boundingRect(shown.astype(np.uint8))
         if width == 0:  # only the ideal image is wide enough to show them
             return None
@@ -168,13 +182,17 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
 class DepthCamera:
     """An RGB-D camera that finds the ball in its noisy images; noise is drawn only at pixels of the ball's colour."""
 
-    def __init__(self, scene: Scene, config: RenderedConfig, camera: PinholeCamera, radius: float) -> None:
+    def __init__(
+        self, scene: Scene, config: RenderedConfig, camera: PinholeCamera, radius: float
+    ) -> None:
         """Take a scene and the radius of its ball [m]."""
         self.camera, self.radius = camera, radius
         self._scene, self._config = scene, config
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
-    def find(self, X_BC: FloatArray, ball: FloatArray, noise: ImageNoise, number: int = 0) -> Detection | None:
+    def find(
+        self, X_BC: FloatArray, ball: FloatArray, noise: ImageNoise, number: int = 0
+    ) -> Detection | None:
         """Return the ball as found in an image of the camera, or None.
 
         Args:
@@ -193,7 +211,9 @@ class DepthCamera:
         if patch is None:
             return None
         depth = self.camera.metric_depth(buffer[patch.rows, patch.columns])
-        measured = measure_depth(self._config, depth, patch, window.shape, self.camera, noise.stream(DEPTH, number))
+        measured = measure_depth(
+            self._config, depth, patch, window.shape, self.camera, noise.stream(DEPTH, number)
+        )
         # A patch touches the border of the window only where the image ends, too.
         patch = Patch(patch.rows + window.top, patch.columns + window.left)
         return locate_ball(patch, measured, self.camera, self.radius)
@@ -212,7 +232,9 @@ class Detector(ABC, Generic[Model]):
     """
 
     @abstractmethod
-    def measure(self, model: Model, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray | None, BoolArray | None]:
+    def measure(
+        self, model: Model, q: FloatArray, noise: ImageNoise
+    ) -> tuple[FloatArray | None, BoolArray | None]:
         """Return the features as measured with the noise of images, (m,), and which are valid, (m,).
 
         No features mean that nothing was found, no mask that all features are valid.
@@ -237,10 +259,15 @@ class BallDetector(Detector[HandEyeModel]):
 
     def __init__(self, scene: Scene, config: RenderedConfig, robot: Robot) -> None:
         """Take a scene with a ball on the flange of a robot."""
-        camera, ball_radius = CAMERA.reaching(robot.workspace.camera_distance), robot.workspace.ball_radius
+        camera, ball_radius = (
+            CAMERA.reaching(robot.workspace.camera_distance),
+            robot.workspace.ball_radius,
+        )
         self._scene, self._camera = scene, DepthCamera(scene, config, camera, ball_radius)
 
-    def measure(self, model: HandEyeModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray | None, None]:
+    def measure(
+        self, model: HandEyeModel, q: FloatArray, noise: ImageNoise
+    ) -> tuple[FloatArray | None, None]:
         """Return the ball's centre as fitted to the depths, (3,) m, or None."""
         found = self._camera.find(model.X_BC, self._scene.ball_position(), noise)
         if found is None:
@@ -271,16 +298,22 @@ class BallDetector(Detector[HandEyeModel]):
 class MarkCameras:
     """Cameras without depth, in whose images marks are found."""
 
-    def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig, radius: float) -> None:
+    def __init__(
+        self, model: SetupModel, scene: Scene, config: RenderedConfig, radius: float
+    ) -> None:
         """Take a scene with the target of a set-up, whose ball or discs have a radius [m]."""
         self._scene, self._planned = scene, model.planned.reaching(model.distance)
-        self._lenses = [Lens(self._planned, model.optics, camera) for camera in range(model.setup.cameras)]
+        self._lenses = [
+            Lens(self._planned, model.optics, camera) for camera in range(model.setup.cameras)
+        ]
         self._radius = radius
         self._colours = MARK_COLOURS[: len(model.target)]
         self._centre = sphere_centre if len(model.target) == 1 else disc_centre
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
-    def find(self, model: SetupModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray, BoolArray]:
+    def find(
+        self, model: SetupModel, q: FloatArray, noise: ImageNoise
+    ) -> tuple[FloatArray, BoolArray]:
         """Return the points in the frame of each camera, (c, p, 3) m at a depth of 1 m, and which are found, (c, p)."""
         marks: list[Sequence[Mark | None]] = []
         poses = camera_poses(model, q)
@@ -314,7 +347,10 @@ class MarkCameras:
     def _measure(self, marks: Sequence[Sequence[Mark | None]]) -> tuple[BoolArray, FloatArray]:
         """Return which marks are found, (c, p), and where, (c, p, 2) px; the middle of the image for the others."""
         middle = np.array([self._planned.width, self._planned.height]) / 2.0
-        pixels = [[middle if mark is None else self._centre(mark, self._planned) for mark in row] for row in marks]
+        pixels = [
+            [middle if mark is None else self._centre(mark, self._planned) for mark in row]
+            for row in marks
+        ]
         return np.array([[mark is not None for mark in row] for row in marks]), np.array(pixels)
 
 
@@ -322,7 +358,9 @@ class MarkCameras:
 class BallCameras:
     """Cameras with depth, which fit a sphere to the ball."""
 
-    def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
+    def __init__(
+        self, model: SetupModel, scene: Scene, config: RenderedConfig, ball_radius: float
+    ) -> None:
         """Take a scene with a ball.
 
         Raises:
@@ -330,13 +368,26 @@ class BallCameras:
         """
         name = model.setup.name
         if len(model.target) > 1:
-            raise ValueError(f"sensing {name} needs the depth of {len(model.target)} points; only a ball's is measured")
-        points, planned = _some_points(model.setup), ideal_optics(model.planned, model.setup.cameras)
-        if (model.setup.measure(points, model.optics) != model.setup.measure(points, planned)).any():
-            raise ValueError(f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned")
-        self._camera = DepthCamera(scene, config, model.planned.reaching(model.distance), ball_radius)
+            raise ValueError(
+                f"sensing {name} needs the depth of {len(model.target)} points; only a ball's is measured"
+            )
+        points, planned = (
+            _some_points(model.setup),
+            ideal_optics(model.planned, model.setup.cameras),
+        )
+        if (
+            model.setup.measure(points, model.optics) != model.setup.measure(points, planned)
+        ).any():
+            raise ValueError(
+                f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned"
+            )
+        self._camera = DepthCamera(
+            scene, config, model.planned.reaching(model.distance), ball_radius
+        )
 
-    def find(self, model: SetupModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray, BoolArray]:
+    def find(
+        self, model: SetupModel, q: FloatArray, noise: ImageNoise
+    ) -> tuple[FloatArray, BoolArray]:
         """Return the ball in the frame of each camera, (c, 1, 3) m, and which cameras found it, (c, 1)."""
         ball = model.target[0] if model.mount == "hand" else model.points(q)[0]
         poses = enumerate(camera_poses(model, q))
@@ -346,7 +397,9 @@ class BallCameras:
 
     def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
         """Return the images of all cameras side by side, with the detected ball marked, (h, w, 3)."""
-        return np.concatenate([self._camera.picture(pose) for pose in camera_poses(model, q)], axis=1)
+        return np.concatenate(
+            [self._camera.picture(pose) for pose in camera_poses(model, q)], axis=1
+        )
 
 
 @final
@@ -357,7 +410,9 @@ class SetupDetector(Detector[SetupModel]):
         """Take the cameras."""
         self._cameras = cameras
 
-    def measure(self, model: SetupModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray, BoolArray]:
+    def measure(
+        self, model: SetupModel, q: FloatArray, noise: ImageNoise
+    ) -> tuple[FloatArray, BoolArray]:
         """See `Detector.measure`."""
         points, found = self._cameras.find(model, q, noise)
         feature = model.setup.measure(points, model.optics)
@@ -386,7 +441,9 @@ class SetupDetector(Detector[SetupModel]):
         return self._cameras.picture(model, q)
 
 
-def open_detector(model: RobotModel, scene: Scene, config: RenderedConfig, robot: Robot) -> Detector[Any]:
+def open_detector(
+    model: RobotModel, scene: Scene, config: RenderedConfig, robot: Robot
+) -> Detector[Any]:
     """Return the detector for the cameras of a true robot.
 
     Raises:
@@ -404,13 +461,17 @@ def open_detector(model: RobotModel, scene: Scene, config: RenderedConfig, robot
 def needs_depth(setup: SensingSetup, optics: Optics) -> bool:
     """Return whether the features change when points move along the rays on which they are found."""
     near = _some_points(setup)
-    return not np.allclose(setup.measure(near, optics), setup.measure(2.0 * near, optics), rtol=1e-9, atol=1e-9)
+    return not np.allclose(
+        setup.measure(near, optics), setup.measure(2.0 * near, optics), rtol=1e-9, atol=1e-9
+    )
 
 
 def _some_points(setup: SensingSetup) -> FloatArray:
     """Return points (c, p, 3) m in front of all cameras, no two alike."""
     count = setup.cameras * len(setup.target)
-    points = np.stack([0.1 * np.sin(np.arange(count)), 0.1 * np.cos(np.arange(count)), np.ones(count)], axis=-1)
+    points = np.stack(
+        [0.1 * np.sin(np.arange(count)), 0.1 * np.cos(np.arange(count)), np.ones(count)], axis=-1
+    )
     return points.reshape(setup.cameras, len(setup.target), 3)
 
 
@@ -421,7 +482,9 @@ def camera_poses(model: SetupModel, q: FloatArray) -> FloatArray:
     return np.asarray(model.arm.frames(q)[-1] @ model.cameras)
 
 
-def depth_deviation(config: RenderedConfig, depth: npt.ArrayLike, camera: PinholeCamera) -> FloatArray:
+def depth_deviation(
+    config: RenderedConfig, depth: npt.ArrayLike, camera: PinholeCamera
+) -> FloatArray:
     """Return the standard deviation σ, m, at true depths of any shape, m."""
     z = np.asarray(depth, dtype=np.float64)
     if config.depth_noise == "stereo":
@@ -452,7 +515,9 @@ def measure_depth(
     """
     z = depth
     if config.depth_noise != "none":
-        noise = _unit_noise(config.depth_patch * camera.width / config.native_width, shape, generator)
+        noise = _unit_noise(
+            config.depth_patch * camera.width / config.native_width, shape, generator
+        )
         deviation = config.sensing.noise_factor * depth_deviation(config, z, camera)
         z = z + deviation * noise[patch.rows, patch.columns]
     if config.depth_quantisation > 0.0:

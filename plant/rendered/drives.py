@@ -121,7 +121,11 @@ class Drives:
         self._compensation = config.friction_compensation / h
         self._viscous = h * np.broadcast_to(config.viscous_friction, n)
         self._coulomb = h * np.broadcast_to(config.coulomb_friction, n)
-        self.angle, self.speed, self.assumed_gravity = body or (np.zeros(n), np.zeros(n), np.zeros(n))
+        self.angle, self.speed, self.assumed_gravity = body or (
+            np.zeros(n),
+            np.zeros(n),
+            np.zeros(n),
+        )
         self.command, self.torque, self.drag = np.zeros(n), np.zeros(n), np.zeros(n)
         self._loops, self._next = np.zeros((3, n)), np.zeros((3, n))
         moved = blend, self.command, self._loops.ravel()
@@ -177,7 +181,9 @@ class Drives:
         """Return (blend, u, loops) -> loops with the reference one physics step later."""
         arguments = blend, u, loops = _symbols(blend=1, u=n, loops=3 * n)
         r, c, z = casadi.vertsplit(loops, n)
-        return casadi.Function("reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)])
+        return casadi.Function(
+            "reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)]
+        )
 
     def _law(self, n: int) -> casadi.Function:
         """Return (blend, u, loops, θ, ω, ĝ) -> loops a physics step later, torque and drag for this step."""

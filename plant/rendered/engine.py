@@ -45,7 +45,9 @@ class Scene(ABC):
         """Return the ball's centre in the base frame, (3,) m, from the engine's own kinematics."""
 
     @abstractmethod
-    def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> Image:
         """Return the image of a camera at X_BC (4, 4): colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
 
         With a window only this part of the image; its pixels are those of the whole image, but for rounding.
@@ -66,7 +68,9 @@ class Machine:
     drives: DriveConfig  # loops, torque limits, friction and load of the joints
     lag: float  # [s] by which the drives smooth commanded velocities, 0 for none
     start: FloatArray  # (n,) [rad], joint angles at which the loops are tuned
-    stops: tuple[FloatArray, FloatArray]  # (n,) and (n,) [rad], lower and upper stop of the joint angles
+    stops: tuple[
+        FloatArray, FloatArray
+    ]  # (n,) and (n,) [rad], lower and upper stop of the joint angles
     physics_step: float = PHYSICS_STEP  # [s]
 
 
@@ -108,6 +112,8 @@ class Engine(NamedTuple):
 
     scene: type[Scene]  # for the camera
     simulation: Callable[[Machine], Simulation]  # for the motion
-    describe: Callable[[], str]  # returns one line about the engine and the library that renders its images
+    describe: Callable[
+        [], str
+    ]  # returns one line about the engine and the library that renders its images
     # returns one line about missing parts of this machine; empty if nothing is missing
     lacking: Callable[[], str] = str

@@ -33,7 +33,9 @@ class MarkColour(NamedTuple):
     """The colour of a mark."""
 
     paint: Colour  # red, green, blue and opacity
-    hues: HueRange  # in which its pixels are, if OpenCV is fed with red, green, blue; no two overlap
+    hues: (
+        HueRange  # in which its pixels are, if OpenCV is fed with red, green, blue; no two overlap
+    )
 
 
 MARK_COLOURS: Final = (
@@ -56,7 +58,9 @@ class Mark(NamedTuple):
     shares: FloatArray  # (k,), of each of them that the mark has
 
 
-def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...], corner: tuple[int, int] = (0, 0)) -> list[Mark | None]:
+def find_marks(
+    rgb: ByteArray, colours: tuple[MarkColour, ...], corner: tuple[int, int] = (0, 0)
+) -> list[Mark | None]:
     """Return the mark of each colour, or None where it is not wholly visible.
 
     Args:
@@ -71,12 +75,16 @@ def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...], corner: tuple[in
     for number, mask in enumerate(masks):
         patch, others = largest_patch(mask), grown[:number] + grown[number + 1 :]
         whole = patch if patch is None or others or fills_ellipse(patch) else _hull(patch)
-        touched = patch is not None and any(other[patch.rows, patch.columns].any() for other in others)
+        touched = patch is not None and any(
+            other[patch.rows, patch.columns].any() for other in others
+        )
         if patch is None or whole is None or touched or not fills_ellipse(whole):
             found.append(None)
         else:
             mark = _with_shares(patch, whole, rgb, colours[number].paint)
-            found.append(mark._replace(rows=mark.rows + corner[0], columns=mark.columns + corner[1]))
+            found.append(
+                mark._replace(rows=mark.rows + corner[0], columns=mark.columns + corner[1])
+            )
     return found
 
 

@@ -27,7 +27,15 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
-from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Image, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.engine import (
+    MIN_OVERLAP,
+    Engine,
+    Image,
+    Machine,
+    Overlap,
+    Scene,
+    Simulation,
+)
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
@@ -37,16 +45,19 @@ if mujoco.get_mju_user_warning() is None:
     # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; a wrong motion shows in the joints.
     mujoco.set_mju_user_warning(lambda _: None)
 
-LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # on Linux, in order of preference
+# On Linux, in order of preference
+LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
 ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # OpenGL platforms of other systems
 INSTALL: Final = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
-SLICES, STACKS = 24, 6  # mesh of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
+# Mesh of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
+SLICES, STACKS = (24, 6)
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
 MAX_PARTS = 1000  # largest number of drawn parts
 SHOWN, HIDDEN = 0, 5  # groups of parts, of which MuJoCo draws the first three
 COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
-STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, the shortest that MuJoCo integrates well
+# [s] time constant of stops and friction, the shortest that MuJoCo integrates well
+STIFF: float = 2.0 * PHYSICS_STEP
 # MuJoCo would leave out shapes that are only drawn, and join bodies that do not move against each other.
 KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="false" strippath="true"/></mujoco>'
 
@@ -84,7 +95,9 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
             return context
     except Exception as error:  # a missing part shows in many ways, by library and by driver
         why = " ".join(str(error).split())
-        raise ValueError(f"MuJoCo cannot render through {name} ({type(error).__name__}: {why}): {INSTALL}") from error
+        raise ValueError(
+            f"MuJoCo cannot render through {name} ({type(error).__name__}: {why}): {INSTALL}"
+        ) from error
 
 
 @contextmanager
@@ -158,7 +171,9 @@ class MujocoScene(Scene):
         """See `Scene.ball_position`."""
         return np.array(self._data.xpos[self._ball])
 
-    def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> Image:
         """See `Scene.render`."""
         rgb, depth = self.draw(camera, X_BC, window or whole(camera))
         # Beyond the floor is black, to be white. A sky of MuJoCo's would stand in front of far things.
@@ -174,7 +189,9 @@ class MujocoScene(Scene):
         """
         self._leave_out(camera, X_BC, window)
         kinds = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._options, None, self._view, kinds, self._drawn)
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._options, None, self._view, kinds, self._drawn
+        )
         for gl_camera in self._drawn.camera:
             _aim(gl_camera, camera, X_BC)
         shape, context = window.shape, self._context
@@ -184,7 +201,9 @@ class MujocoScene(Scene):
             if camera.width > context.offWidth or camera.height > context.offHeight:
                 size = max(camera.width, context.offWidth), max(camera.height, context.offHeight)
                 mujoco.mjr_resizeOffscreen(*size, context)
-            mujoco.mjr_render(mujoco.MjrRect(0, 0, camera.width, camera.height), self._drawn, context)
+            mujoco.mjr_render(
+                mujoco.MjrRect(0, 0, camera.width, camera.height), self._drawn, context
+            )
             mujoco.mjr_readPixels(rgb, depth, mujoco.MjrRect(*part), context)
         return rgb, depth
 
@@ -192,7 +211,9 @@ class MujocoScene(Scene):
         """Hide the parts whose bounding spheres are outside of the pyramid of rays through a window."""
         columns, rows = (window.left, window.right), (window.top, window.bottom)
         (left, top, _), (right, bottom, _) = camera.rays(columns, rows).tolist()
-        inwards = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+        inwards = np.array(
+            [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+        )
         inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
         centres = (self._data.geom_xpos - X_BC[:3, 3]) @ (X_BC[:3, :3] @ inwards.T)
         reached = (centres >= -self._model.geom_rbound[:, None]).all(axis=1)
@@ -210,7 +231,9 @@ class MujocoScene(Scene):
 def _compile(room: Room) -> Any:  # noqa: ANN401
     """Return the model of all drawn bodies, an `MjModel`."""
     files = room.files()
-    (_, spec), *around = [(name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")]
+    (_, spec), *around = [
+        (name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")
+    ]
     for name, body in around:
         spec.attach(body, prefix=f"{name}/", frame=spec.worldbody.add_frame())
     spec.worldbody.add_light(
@@ -236,7 +259,11 @@ def _aim(gl_camera: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # no
     half = 0.5 * camera.height * pixel
     gl_camera.frustum_center, gl_camera.frustum_width = right, 0.5 * camera.width * pixel
     gl_camera.frustum_bottom, gl_camera.frustum_top = -half - down, half - down
-    gl_camera.frustum_near, gl_camera.frustum_far, gl_camera.orthographic = camera.near, camera.far, 0
+    gl_camera.frustum_near, gl_camera.frustum_far, gl_camera.orthographic = (
+        camera.near,
+        camera.far,
+        0,
+    )
 
 
 class MujocoSimulation(Simulation):
@@ -267,7 +294,9 @@ class MujocoSimulation(Simulation):
         self._placed, self._bodies = mujoco.MjData(self._shapes), self._shapes.geom_bodyid.tolist()
         body = self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp
         inertia = _assumed_inertia(machine)
-        self._drives = Drives(drives, machine.lag, inertia, machine.stops, body, machine.physics_step)
+        self._drives = Drives(
+            drives, machine.lag, inertia, machine.stops, body, machine.physics_step
+        )
 
     def start(self, angle: FloatArray) -> DriveState:
         """See `Simulation.start`."""
@@ -320,17 +349,23 @@ def _moving(machine: Machine) -> Any:  # noqa: ANN401
     option.timestep = machine.physics_step
     option.gravity = (0.0, 0.0, -GRAVITY)
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # Joints that are not finite have to be detected.
+    # Joints that are not finite have to be detected.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     for joint, lower, upper in zip(spec.joints, *machine.stops, strict=True):
         joint.limited, joint.range = True, (lower, upper)
     model = spec.compile()
     model.dof_armature[:] = drives.rotor_inertia
-    model.dof_damping[:], model.dof_frictionloss[:] = drives.viscous_friction, drives.coulomb_friction
+    model.dof_damping[:], model.dof_frictionloss[:] = (
+        drives.viscous_friction,
+        drives.coulomb_friction,
+    )
     for solution in (model.jnt_solref, model.dof_solref):
         solution[:] = STIFF, 1.0
     model.body_gravcomp[:] = 1.0
     light = LIGHT_PART[0]
-    model.body_gravcomp[model.body(BALL_LINK).id] = (light + drives.assumed_payload) / (light + drives.payload)
+    model.body_gravcomp[model.body(BALL_LINK).id] = (light + drives.assumed_payload) / (
+        light + drives.payload
+    )
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
@@ -338,7 +373,9 @@ def _moving(machine: Machine) -> Any:  # noqa: ANN401
 def _assumed_inertia(machine: Machine) -> FloatArray:
     """Return the inertia of links and assumed load at the start, (n, n) [kg m²], without the rotors."""
     payload = machine.drives.assumed_payload
-    model = read_urdf(arm_mechanics(machine.arm, payload, shapes=False, robot=machine.robot)).compile()
+    model = read_urdf(
+        arm_mechanics(machine.arm, payload, shapes=False, robot=machine.robot)
+    ).compile()
     data, columns = mujoco.MjData(model), np.empty((model.nv, model.nv))
     data.qpos[:] = machine.start
     mujoco.mj_forward(model, data)
@@ -353,7 +390,9 @@ def _solid(machine: Machine) -> tuple[Any, dict[int, str]]:
     boxes = (*room_boxes(machine.robot.workspace.scale), *machine.boxes)
     for box in boxes:
         half = [side / 2.0 for side in box.size]
-        spec.worldbody.add_geom(name=box.name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre, size=half)
+        spec.worldbody.add_geom(
+            name=box.name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre, size=half
+        )
     model = spec.compile()
     return model, {model.geom(box.name).id: box.name for box in boxes}
 

@@ -46,7 +46,10 @@ def mujoco_lacks() -> str:
     """Return how to install the renderer that this machine lacks; empty if it can render."""
     try:
         return load_engine("mujoco").lacking()
-    except (ImportError, RuntimeError) as error:  # incompatible parts, or a MUJOCO_GL that MuJoCo does not know
+    except (
+        ImportError,
+        RuntimeError,
+    ) as error:  # incompatible parts, or a MUJOCO_GL that MuJoCo does not know
         return f"MuJoCo cannot be loaded: {error}"
 
 

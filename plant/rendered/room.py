@@ -39,7 +39,9 @@ class Room:
     scenery: bool  # whether the table and the floor are there
     robot: Robot  # by its maker's description, for the visual shapes
     boxes: tuple[Box, ...] = ()  # obstacles
-    model: SetupModel | None = None  # target and cameras of a sensing set-up; None for the ball on the flange
+    model: SetupModel | None = (
+        None  # target and cameras of a sensing set-up; None for the ball on the flange
+    )
 
     def files(self) -> dict[str, str]:
         """Return the files, text by name: a URDF for each body, that of the arm first, and the meshes they name.
@@ -57,7 +59,9 @@ class Room:
     def _own_files(self) -> dict[str, str]:
         """Return the files of the arm with its target or cameras, and of a target in the world."""
         tree, model = urdf.arm_tree(self.arm, self.robot), self.model
-        if model is None or (model.mount == "fixed" and len(model.target) == 1):  # the ball, which every arm carries
+        if model is None or (
+            model.mount == "fixed" and len(model.target) == 1
+        ):  # the ball, which every arm carries
             return {"arm.urdf": urdf.text(tree)}
         (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
         for visual in carried.findall("visual"):
@@ -72,7 +76,9 @@ class Room:
         body, middle = ET.Element("robot", name="target"), model.target.mean(axis=0)
         urdf.add_link(body, "world", *urdf.BASE_PART)
         self._draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), model, -middle)
-        urdf.add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
+        urdf.add_joint(
+            body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False
+        )
         return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
 
     def _draw_target(self, link: ET.Element, model: SetupModel, shift: FloatArray) -> None:
@@ -81,17 +87,26 @@ class Room:
         if len(points) == 1:
             urdf.draw_mesh(link, RED, urdf.BALL_MESH, self.robot.workspace.ball_radius)
             return
-        normal = np.cross(points[1] - points[0], points[2] - points[0]) if len(points) > 2 else np.zeros(3)
+        normal = (
+            np.cross(points[1] - points[0], points[2] - points[0])
+            if len(points) > 2
+            else np.zeros(3)
+        )
         length = np.linalg.norm(normal)
         if len(points) > len(MARK_COLOURS) or not length > 1e-9:
-            wanted = "a ball, of one point, or a plate with three or four discs that are not in line"
+            wanted = (
+                "a ball, of one point, or a plate with three or four discs that are not in line"
+            )
             came = f"sensing {model.setup.name} has a target of {len(points)} points"
             raise ValueError(f"{came}; only these can be drawn: {wanted}")
-        back, middle = LAYER * scale * (normal / length), points.mean(axis=0)  # away from the side of the discs
+        # Away from the side of the discs
+        back, middle = (LAYER * scale * (normal / length), points.mean(axis=0))
         for point, colour in zip(points, MARK_COLOURS, strict=False):
             urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
             urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
-            urdf.draw_cylinder(link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
+            urdf.draw_cylinder(
+                link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale
+            )
 
 
 def target_scale(model: SetupModel, robot: Robot) -> float:
@@ -123,7 +138,9 @@ class Overview:
             fineness: pixels for one pixel of `OVERVIEW_CAMERA`, along each side; above 1 edges become smooth once
                 scaled down.
         """
-        width, height = (round(fineness * side) for side in (OVERVIEW_CAMERA.width, OVERVIEW_CAMERA.height))
+        width, height = (
+            round(fineness * side) for side in (OVERVIEW_CAMERA.width, OVERVIEW_CAMERA.height)
+        )
         pose = _look_at(scale * np.array(OVERVIEW_POSITION), scale * np.array(OVERVIEW_TARGET))
         distance = scale * float(np.linalg.norm(np.subtract(OVERVIEW_POSITION, OVERVIEW_TARGET)))
         return cls(replace(OVERVIEW_CAMERA.reaching(distance), width=width, height=height), pose)

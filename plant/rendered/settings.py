@@ -65,9 +65,17 @@ class DriveConfig:
         Raises:
             ValueError: a list of another length.
         """
-        for name in ("velocity_bandwidth", "torque_limit", "rotor_inertia", "coulomb_friction", "viscous_friction"):
+        for name in (
+            "velocity_bandwidth",
+            "torque_limit",
+            "rotor_inertia",
+            "coulomb_friction",
+            "viscous_friction",
+        ):
             if len(getattr(self, name)) not in {1, n}:
-                raise ValueError(f"{name} must have 1 or {n} numbers, got {len(getattr(self, name))}")
+                raise ValueError(
+                    f"{name} must have 1 or {n} numbers, got {len(getattr(self, name))}"
+                )
 
 
 def drives_for(robot: Robot) -> DriveConfig:
@@ -137,7 +145,9 @@ class RenderedConfig:
     def boxes(self) -> tuple[Box, ...]:
         """Return the obstacles."""
         boxes = enumerate(self.obstacles, 1)
-        return tuple(Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in boxes)
+        return tuple(
+            Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in boxes
+        )
 
 
 def rendered_config(robot: Robot) -> RenderedConfig:

@@ -33,7 +33,8 @@ FLOOR_DROP, TILE = 0.75, 0.4  # [m] floor below the table's top; side of a floor
 LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBullet's default is 1 kg
 BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
 BALL_MESH = "ball.obj"  # file of the unit sphere in URDFs
-EDGES = 0.5257311121191336, 0.85065080835204  # halves of the sides of the golden rectangles of an icosahedron
+# Halves of the sides of the golden rectangles of an icosahedron
+EDGES = (0.5257311121191336, 0.85065080835204)
 TRIANGLES = "0b5 051 017 07a 0ab 159 5b4 ba2 a76 718 394 342 326 368 389 495 24b 62a 867 981"  # by its vertices
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 
@@ -79,7 +80,9 @@ def add_link(
     rpy, (xx, yy, zz) = _principal(np.asarray(inertia, dtype=np.float64), along)
     ET.SubElement(inertial, "origin", xyz=numbers(centre), rpy=numbers(rpy))
     ET.SubElement(inertial, "mass", value=repr(float(mass)))
-    ET.SubElement(inertial, "inertia", ixx=repr(xx), iyy=repr(yy), izz=repr(zz), ixy="0", ixz="0", iyz="0")
+    ET.SubElement(
+        inertial, "inertia", ixx=repr(xx), iyy=repr(yy), izz=repr(zz), ixy="0", ixz="0", iyz="0"
+    )
     return link
 
 
@@ -93,7 +96,9 @@ def _principal(inertia: FloatArray, along: npt.ArrayLike) -> tuple[FloatArray, l
     return rpy_from_rotation(axes), moments.tolist()
 
 
-def add_joint(robot: ET.Element, name: str, ends: tuple[str, str], origin: FloatArray, *, turns: bool) -> None:
+def add_joint(
+    robot: ET.Element, name: str, ends: tuple[str, str], origin: FloatArray, *, turns: bool
+) -> None:
     """Add a joint about z, or a fixed one.
 
     Args:
@@ -111,17 +116,23 @@ def add_joint(robot: ET.Element, name: str, ends: tuple[str, str], origin: Float
         ET.SubElement(joint, "axis", xyz="0 0 1")
 
 
-def add_visual(link: ET.Element, colour: Colour, xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> ET.Element:
+def add_visual(
+    link: ET.Element, colour: Colour, xyz: npt.ArrayLike, rpy: npt.ArrayLike
+) -> ET.Element:
     """Add a drawn part at `xyz` (3,) m, `rpy` (3,) rad of the body frame and return its empty geometry."""
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=numbers(xyz), rpy=numbers(rpy))
     # PyBullet keeps materials by name, so every colour needs a name of its own.
-    material = ET.SubElement(visual, "material", name="rgba_" + "_".join(f"{255 * part:.0f}" for part in colour))
+    material = ET.SubElement(
+        visual, "material", name="rgba_" + "_".join(f"{255 * part:.0f}" for part in colour)
+    )
     ET.SubElement(material, "color", rgba=numbers(colour))
     return ET.SubElement(visual, "geometry")
 
 
-def draw_cylinder(link: ET.Element, colour: Colour, start: npt.ArrayLike, end: npt.ArrayLike, radius: float) -> None:
+def draw_cylinder(
+    link: ET.Element, colour: Colour, start: npt.ArrayLike, end: npt.ArrayLike, radius: float
+) -> None:
     """Draw a cylinder between two points (3,) m of the body frame; nothing where they coincide."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(b - a))
@@ -153,9 +164,13 @@ def sphere_obj(subdivisions: int = BALL_SUBDIVISIONS) -> str:
     short, long = EDGES
     base = np.array([[x * short, y * long, 0.0] for y in (1, -1) for x in (-1, 1)])
     vertices = np.concatenate([np.roll(base, turn, axis=1) for turn in range(3)])
-    triangles = np.array([[int(corner, 16) for corner in triangle] for triangle in TRIANGLES.split()])
+    triangles = np.array(
+        [[int(corner, 16) for corner in triangle] for triangle in TRIANGLES.split()]
+    )
     for _ in range(subdivisions):
-        edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+        edges = np.sort(
+            np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1
+        )
         keys = edges[:, 1] * len(vertices) + edges[:, 0]
         _, first, place = np.unique(keys, return_index=True, return_inverse=True)
         (a, b, c), (ab, bc, ca) = triangles.T, len(vertices) + place.reshape(-1, 3).T
@@ -252,12 +267,15 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     """
     own, ball_radius = described.links, described.workspace.ball_radius
     if arm.n != described.n:
-        raise ValueError(f"arm must have {described.n} joints like the {described.title}, got {arm.n}")
+        raise ValueError(
+            f"arm must have {described.n} joints like the {described.title}, got {arm.n}"
+        )
     mass, radius, aside = own.mass.tolist(), own.radius.tolist(), own.aside.tolist()
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    base = add_link(robot, BASE_LINK, *BASE_PART)  # with a foot on the table and a stem up to the first joint
+    # With a foot on the table and a stem up to the first joint
+    base = add_link(robot, BASE_LINK, *BASE_PART)
     draw_cylinder(base, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius[0])
     draw_cylinder(base, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius[0])
     draw_cylinder(base, ALUMINIUM, (0.0, 0.0, 0.0), arm.translation[0], radius[0])
@@ -272,10 +290,13 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
         _draw_link(link, step, radius[i], aside[i])
         add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    flange = add_link(robot, FLANGE_LINK, *LIGHT_PART)  # with a plate and the stick that carries the ball
+    # With a plate and the stick that carries the ball
+    flange = add_link(robot, FLANGE_LINK, *LIGHT_PART)
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius[-1])
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, 0.0), arm.tool, 0.25 * ball_radius)
-    add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
+    add_joint(
+        robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False
+    )
     draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, BALL_MESH, ball_radius)
     return robot
 
@@ -318,12 +339,18 @@ def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -
     far_aside = abs(side) > radius
     # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
     outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
-    draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
+    draw_cylinder(
+        link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius
+    )
     draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
     draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
     draw_cylinder(link, DARK_GREY, corner, step, 0.95 * radius)
     if far_aside:
-        draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
-        draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
+        draw_cylinder(
+            link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius
+        )
+        draw_cylinder(
+            link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius
+        )
     else:
         draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)

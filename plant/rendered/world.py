@@ -31,7 +31,9 @@ from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
-CONTACT_STEPS = 10  # physics steps between two checks for contact, 10 mm at 1 m/s; and at the end of a period
+CONTACT_STEPS = (
+    10  # physics steps between two checks for contact, 10 mm at 1 m/s; and at the end of a period
+)
 LAST_ON_TABLE = 1  # base and shoulder stand on the table
 # Base and upper arm, whose housings meet inside the shoulder in every pose.
 BUILT_INTO_EACH_OTHER: set[int | str] = {0, 2}
@@ -41,7 +43,11 @@ class Contacts:
     """The contact of one arm; neighbouring links never count, nor do base and shoulder on their table."""
 
     def __init__(
-        self, overlaps: Callable[[FloatArray], Iterable[Overlap]], arm: SerialArm, robot: Robot, config: RenderedConfig
+        self,
+        overlaps: Callable[[FloatArray], Iterable[Overlap]],
+        arm: SerialArm,
+        robot: Robot,
+        config: RenderedConfig,
     ) -> None:
         """Find the links that are built into each other.
 
@@ -95,9 +101,14 @@ class RenderedWorld(World):
         model, start = setup.robot()
         self._config, self._model, arm = config, model, model.arm
         self.lag = config.lag
-        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
+        self.spec = hand_eye_spec(
+            model, setup.period, config.max_joint_speed, config.joint_range, setup.limits
+        )
         sensing = config.sensing
-        if any(sensing.extents(self.spec.feature.unit)[each] for each in (0, 2)) or sensing.outliers > 0.0:
+        if (
+            any(sensing.extents(self.spec.feature.unit)[each] for each in (0, 2))
+            or sensing.outliers > 0.0
+        ):
             self.noise_unit = model.noise_unit  # without noise, features keep their bits
         self._start = as_array("start", start, (self.spec.n,))
         self._steps = fewest_parts(setup.period, PHYSICS_STEP)
@@ -109,14 +120,18 @@ class RenderedWorld(World):
         self._camera = model.camera
         self._valid: BoolArray | None = None
         boxes = config.boxes()
-        room = Room(arm, config.scenery, robot, boxes, model if isinstance(model, SetupModel) else None)
+        room = Room(
+            arm, config.scenery, robot, boxes, model if isinstance(model, SetupModel) else None
+        )
         self._scene = engine.scene(room, window=config.view)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
         ordered = np.minimum(*stops), np.maximum(*stops)
         angle = arm.joint_angle(self._start)
         try:
             self._detector = open_detector(model, self._scene, config, robot)
-            machine = Machine(arm, robot, boxes, config.drives, config.lag, angle, ordered, self._physics_step)
+            machine = Machine(
+                arm, robot, boxes, config.drives, config.lag, angle, ordered, self._physics_step
+            )
             self._simulation = engine.simulation(machine)
         except BaseException:
             self._scene.close()
@@ -150,13 +165,17 @@ class RenderedWorld(World):
             last = min(first + CONTACT_STEPS, self._steps)
             self._joints = self._simulation.advance(self._joints, speed, last - first)
             if not np.isfinite(self._joints.angle).all():
-                raise PlantDiverged(f"joint positions are not finite: {self._joints.angle.tolist()}")
+                raise PlantDiverged(
+                    f"joint positions are not finite: {self._joints.angle.tolist()}"
+                )
             self._check_contact(last)
         self._scene.place(self._joints.angle)
         self._periods += 1
         if self._config.view:
             # The window shows the run at the pace of the wall clock.
-            time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
+            time.sleep(
+                max(0.0, self._started + self._periods * self.spec.period - time.perf_counter())
+            )
         return self._reported()
 
     def _check_contact(self, step: int) -> None:
@@ -167,7 +186,9 @@ class RenderedWorld(World):
 
     def see(self) -> FloatArray | None:
         """Return the features as measured now, (m,); None if nothing is found."""
-        feature, self._valid = self._detector.measure(self._model, self._joint_position(), self._noise)
+        feature, self._valid = self._detector.measure(
+            self._model, self._joint_position(), self._noise
+        )
         self._noise = self._noise.next()
         return feature
 

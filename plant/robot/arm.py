@@ -64,7 +64,13 @@ class SerialArm:
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
         n, lead = self.n, np.shape(self.translation)[:-2]
-        shapes = {"translation": (n + 1, 3), "rpy": (n + 1, 3), "joint_offset": (n,), "gear_ratio": (n,), "tool": (3,)}
+        shapes = {
+            "translation": (n + 1, 3),
+            "rpy": (n + 1, 3),
+            "joint_offset": (n,),
+            "gear_ratio": (n,),
+            "tool": (3,),
+        }
         for name, shape in shapes.items():
             object.__setattr__(self, name, as_array(name, getattr(self, name), lead + shape))
 
@@ -102,12 +108,18 @@ class SerialArm:
         theta = self.joint_angle(joint_position)
         lead, fixed = theta.shape[:-1], self._fixed
         if fixed.ndim < 3 + len(lead):
-            fixed = fixed.reshape(self.n + 1, *(1,) * (3 + len(lead) - fixed.ndim), *fixed.shape[1:])
+            fixed = fixed.reshape(
+                self.n + 1, *(1,) * (3 + len(lead) - fixed.ndim), *fixed.shape[1:]
+            )
         angle = (theta if theta.ndim == 1 else np.moveaxis(theta, -1, 0))[..., None]
         # A turn about z makes x c + y s and y c - x s of columns 0 and 1, and leaves the others as they are.
         c, s, x, y = np.cos(angle), np.sin(angle), fixed[:-1, ..., 0], fixed[:-1, ..., 1]
         turned, poses = np.empty((self.n, *lead, 4, 4)), np.empty((self.n + 1, *lead, 4, 4))
-        turned[..., 0], turned[..., 1], turned[..., 2:] = x * c + y * s, y * c - x * s, fixed[:-1, ..., 2:]
+        turned[..., 0], turned[..., 1], turned[..., 2:] = (
+            x * c + y * s,
+            y * c - x * s,
+            fixed[:-1, ..., 2:],
+        )
         poses[0] = turned[0]
         for before, own, pose in zip(poses, (*turned[1:], fixed[-1]), poses[1:], strict=False):
             np.matmul(before, own, out=pose)
@@ -140,7 +152,12 @@ class SerialArm:
 
 
 def arm_from_dh(
-    a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, joint_names: tuple[str, ...], *, modified: bool = False
+    a: npt.ArrayLike,
+    d: npt.ArrayLike,
+    alpha: npt.ArrayLike,
+    joint_names: tuple[str, ...],
+    *,
+    modified: bool = False,
 ) -> SerialArm:
     """Return the arm of a DH table, without a ball.
 
@@ -167,7 +184,9 @@ def arm_from_dh(
     y, z = (-d_ * np.sin(alpha_), d_ * np.cos(alpha_)) if modified else (np.zeros(n + 1), d_)
     rpy = np.zeros((n + 1, 3))
     rpy[:, 0] = alpha_
-    return SerialArm(joint_names, np.stack([a_, y, z], axis=-1), rpy, np.zeros(n), np.ones(n), np.zeros(3))
+    return SerialArm(
+        joint_names, np.stack([a_, y, z], axis=-1), rpy, np.zeros(n), np.ones(n), np.zeros(3)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,4 +216,6 @@ def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float
     """
     if limits is None:
         return JointLimits(np.full(n, -reach), np.full(n, reach), np.full(n, speed))
-    return JointLimits(limits.lower.clip(-reach), limits.upper.clip(max=reach), limits.speed.clip(max=speed))
+    return JointLimits(
+        limits.lower.clip(-reach), limits.upper.clip(max=reach), limits.speed.clip(max=speed)
+    )

@@ -42,12 +42,18 @@ class PinholeCamera:
 
     def reaching(self, distance: float) -> Self:
         """Return the camera with clipping planes that let a target at about this distance [m] be seen."""
-        return replace(self, near=min(self.near, distance / 5.0), far=max(self.far, 1.75 * distance))
+        return replace(
+            self, near=min(self.near, distance / 5.0), far=max(self.far, 1.75 * distance)
+        )
 
     def clipping(self, depths: npt.ArrayLike) -> str:
         """Return words on the clipping planes for an error message; none where all depths [m] are between them."""
         between = f"not between the clipping planes at {self.near:.3g} and {self.far:.3g} m, "
-        return between if np.less(depths, self.near).any() or np.greater(depths, self.far).any() else ""
+        return (
+            between
+            if np.less(depths, self.near).any() or np.greater(depths, self.far).any()
+            else ""
+        )
 
     @property
     def focal(self) -> float:

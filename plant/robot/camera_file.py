@@ -20,18 +20,39 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import NonNegative, Number, Positive, Usual, nested, override, remark, settings
+from servobench.plant.contract.settings import (
+    NonNegative,
+    Number,
+    Positive,
+    Usual,
+    nested,
+    override,
+    remark,
+    settings,
+)
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.camera_formats import LENSES, in_rows, plain_name, read_intrinsics
 
-SYNONYMS: Final[Mapping[str, str]] = {  # names without capitals, blanks, hyphens and underscores -> that of ROS
-    **dict.fromkeys(("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "plumb_bob"),
-    **dict.fromkeys(("rationalpolynomial", "rational", "rationalmodel", "fullopencv"), "rational_polynomial"),
-    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kb", "kb4", "kb8"), "equidistant"),
+SYNONYMS: Final[
+    Mapping[str, str]
+] = {  # names without capitals, blanks, hyphens and underscores -> that of ROS
+    **dict.fromkeys(
+        ("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "plumb_bob"
+    ),
+    **dict.fromkeys(
+        ("rationalpolynomial", "rational", "rationalmodel", "fullopencv"), "rational_polynomial"
+    ),
+    **dict.fromkeys(
+        ("equidistant", "equi", "fisheye", "opencvfisheye", "kb", "kb4", "kb8"), "equidistant"
+    ),
     **dict.fromkeys(("kannalabrandt", "kannalabrandt4", "kannalabrandt8"), "equidistant"),
     **dict.fromkeys(("", "opencv"), ""),
-    **dict.fromkeys(("none", "null", "no", "nodistortion", "undistorted", "rectified", "ideal"), "none"),
-    **dict.fromkeys(("pinhole", "perspective", "inversebrownconrady", "modifiedbrownconrady"), "none"),
+    **dict.fromkeys(
+        ("none", "null", "no", "nodistortion", "undistorted", "rectified", "ideal"), "none"
+    ),
+    **dict.fromkeys(
+        ("pinhole", "perspective", "inversebrownconrady", "modifiedbrownconrady"), "none"
+    ),
 }
 WANTED: Final = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
 RANGES: Final = {  # of numbers: unit, least and largest
@@ -41,13 +62,19 @@ RANGES: Final = {  # of numbers: unit, least and largest
 FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of the image
 MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
 MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
-MAX_MOVED: Final = 0.5  # share of its distance from the middle by which a distortion usually moves a point
+MAX_MOVED: Final = (
+    0.5  # share of its distance from the middle by which a distortion usually moves a point
+)
 ENDLESS: Final = 1e6  # [1] r² of a ray that no image shows
 MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] from the optical axis to it
 ROUNDED_ROOT: Final = 1e-9  # [1] by which the root of a polynomial is off at most
 MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
-IN_STEP: Final = 2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
-MAX_ROUNDED: Final = 0.015  # [1] by which a frame of whole milliseconds may differ from the camera's
+IN_STEP: Final = (
+    2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
+)
+MAX_ROUNDED: Final = (
+    0.015  # [1] by which a frame of whole milliseconds may differ from the camera's
+)
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
 Row = tuple[Number, ...]
 
@@ -65,9 +92,13 @@ class Place:
         """Check the numbers."""
         most = MAX_PLACE.get(self.frame, math.inf)
         if bool(self.frame) != bool(self.position) or len(self.position) not in (0, 3):
-            raise ValueError('a place needs frame, "base" or "flange", and position, three numbers in m')
+            raise ValueError(
+                'a place needs frame, "base" or "flange", and position, three numbers in m'
+            )
         if max(map(abs, self.position), default=0.0) > most:
-            raise ValueError(f"position must be in m, at most {most:g} m on the {self.frame}, got {self.position}")
+            raise ValueError(
+                f"position must be in m, at most {most:g} m on the {self.frame}, got {self.position}"
+            )
 
 
 @settings
@@ -81,18 +112,28 @@ class Pose(Place):
         """Check the numbers."""
         super().__post_init__()
         if self.matrix[2, 2] < MIN_AHEAD and self.frame == "flange":
-            wanted = "z is the optical axis, x points right and y down, and a quaternion is x, y, z, w"
-            remark(f"pose.rotation turns the optical axis by more than 60° from the flange's z axis: {wanted}")
+            wanted = (
+                "z is the optical axis, x points right and y down, and a quaternion is x, y, z, w"
+            )
+            remark(
+                f"pose.rotation turns the optical axis by more than 60° from the flange's z axis: {wanted}"
+            )
 
     @cached_property
     def matrix(self) -> FloatArray:
         """The pose in its frame, (4, 4)."""
         from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
-        given = np.array(self.rotation) if len({np.size(row) for row in self.rotation}) == 1 else np.zeros(0)
+        given = (
+            np.array(self.rotation)
+            if len({np.size(row) for row in self.rotation}) == 1
+            else np.zeros(0)
+        )
         if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
             rotation = Rotation.from_quat(given)
-        elif given.shape == (3, 3) and np.abs(given @ given.T - np.eye(3)).max() < ROUNDED < np.linalg.det(given):
+        elif given.shape == (3, 3) and np.abs(
+            given @ given.T - np.eye(3)
+        ).max() < ROUNDED < np.linalg.det(given):
             rotation = Rotation.from_matrix(given)
         else:
             wanted = "a rotation matrix or a quaternion of length 1"
@@ -176,7 +217,11 @@ class OwnCamera:
         if keys.rate is not None:
             changes["frame_period"] = frame_time(f"camera {self.name}", keys.rate, period)
         changes |= {} if keys.latency is None else {"latency": keys.latency}
-        return override(str(self.files[0]), usual, changes | ({"feature_noise": keys.noise} if keys.noise else {}))
+        return override(
+            str(self.files[0]),
+            usual,
+            changes | ({"feature_noise": keys.noise} if keys.noise else {}),
+        )
 
 
 def frame_time(what: str, rate: float, period: float) -> float:
@@ -210,16 +255,22 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
     values |= {key: in_rows(value) for key, value in values.items() if key == "matrix"}
     keys = override(f"camera file {path}", CameraFile(), values)
     if second and keys.second:
-        raise ValueError(f"camera file {path} is the second of a pair and must name no other, got {keys.second}")
+        raise ValueError(
+            f"camera file {path} is the second of a pair and must name no other, got {keys.second}"
+        )
     with configuration_errors(f"camera file {path}: "):
         files = [path, path.parent / keys.intrinsics] if toml and keys.intrinsics else [path]
         if keys.intrinsics:
             read = read_intrinsics(files[-1])
             if toml and (twice := sorted(set(read) & set(values))):
-                raise ValueError(f"{twice[0]} is given here and by {keys.intrinsics}, its intrinsics; leave one out")
+                raise ValueError(
+                    f"{twice[0]} is given here and by {keys.intrinsics}, its intrinsics; leave one out"
+                )
             keys = override(files[-1].name, keys, read)
         pair = read_camera(path.parent / keys.second, second=True) if keys.second else None
-        camera = OwnCamera((*files, *(pair.files if pair else ())), keys, _matrix(keys), *_lens(keys), pair)
+        camera = OwnCamera(
+            (*files, *(pair.files if pair else ())), keys, _matrix(keys), *_lens(keys), pair
+        )
         _check(camera)
     return camera
 
@@ -227,10 +278,14 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
 def _matrix(keys: CameraFile) -> FloatArray:
     """Return the intrinsic matrix, (3, 3) px, of numbers that are checked."""
     if isinstance(keys.noise, float):
-        raise ValueError(f'noise needs its unit, such as "0.5px", or "2mm" for places by depth; got {keys.noise:g}')  # noqa: TRY004
+        raise ValueError(  # noqa: TRY004
+            f'noise needs its unit, such as "0.5px", or "2mm" for places by depth; got {keys.noise:g}'
+        )
     for name, (unit, least, most) in RANGES.items():
         if (value := getattr(keys, name)) is not None and not least <= value <= most:
-            raise ValueError(f"{name} must be given in {unit}, from {least:g} to {most:g}, got {value:g}")
+            raise ValueError(
+                f"{name} must be given in {unit}, from {least:g} to {most:g}, got {value:g}"
+            )
     size = keys.width, keys.height
     if bool(keys.matrix) == (keys.vertical_fov is not None):
         came = "both" if keys.matrix else "neither"
@@ -243,7 +298,9 @@ def _matrix(keys: CameraFile) -> FloatArray:
     for f in (float(K[0, 0]), float(K[1, 1])):
         if not FOCAL[0] * size[0] <= f <= FOCAL[1] * size[0]:
             wanted = "in px it is the focal length in mm over the side of a pixel in mm"
-            raise ValueError(f"matrix: a focal length of {f:g} px does not fit a width of {size[0]} px; {wanted}")
+            raise ValueError(
+                f"matrix: a focal length of {f:g} px does not fit a width of {size[0]} px; {wanted}"
+            )
     if not ((K[:2, 2] > 0.0) & (K[:2, 2] < size)).all():
         raise ValueError(f"matrix: the principal point {K[:2, 2].tolist()} px must be in the image")
     if (np.abs(K[:2, 2] / size - 0.5) > MAX_OFF).any():
@@ -260,7 +317,9 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
         values = list(given.values())
     lens = SYNONYMS.get(plain_name(keys.distortion_model))
     if lens is None:
-        raise ValueError(f"distortion_model {keys.distortion_model!r} is not known; wanted {WANTED}, or none")
+        raise ValueError(
+            f"distortion_model {keys.distortion_model!r} is not known; wanted {WANTED}, or none"
+        )
     if lens == "none" and any(values):
         named = f"distortion_model {keys.distortion_model!r}"
         raise ValueError(f"{named} must have no coefficients but 0, got {given}; wanted {WANTED}")
@@ -271,14 +330,18 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
     count = len(given)
     if not lens:
         if count == 4 and any(given):
-            remark('distortion of four numbers is k1, k2, p1, p2; of a fisheye, write distortion_model = "equidistant"')
+            remark(
+                'distortion of four numbers is k1, k2, p1, p2; of a fisheye, write distortion_model = "equidistant"'
+            )
         lens = "plumb_bob"
         if any(given[5:]):
             lens = "rational_polynomial"
     wanted = len(LENSES[lens])
     whole = count >= wanted or not any(given[5:])
     if not whole or any(given[wanted:]) or 0 < count < 4 or (lens == "equidistant" and not count):
-        raise ValueError(f"distortion must be of {lens} with {', '.join(LENSES[lens])}, got {given}; wanted {WANTED}")
+        raise ValueError(
+            f"distortion must be of {lens} with {', '.join(LENSES[lens])}, got {given}; wanted {WANTED}"
+        )
     return _least_lens(lens, (*given, *(0.0,) * wanted)[:wanted])
 
 
@@ -289,7 +352,9 @@ def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tup
     lens = lens or "plumb_bob"
     unknown = sorted(name for name, value in given.items() if value and name not in LENSES[lens])
     if unknown:
-        raise ValueError(f"distortion has no coefficient {unknown[0]!r} in {lens}; wanted distortion_model {WANTED}")
+        raise ValueError(
+            f"distortion has no coefficient {unknown[0]!r} in {lens}; wanted distortion_model {WANTED}"
+        )
     return _least_lens(lens, tuple(given.get(name, 0.0) for name in LENSES[lens]))
 
 
@@ -351,7 +416,9 @@ def _check(camera: OwnCamera) -> None:
     The image of a fisheye may be a circle that does not reach the corners: of it the nearest border counts.
     """
     D, K, keys = camera.distortion, camera.matrix, camera.keys
-    far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
+    far = [
+        max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))
+    ]
     fisheye = camera.lens == "equidistant"
     turn = turning_point(D)
     last = (1.0 - ROUNDED_ROOT) * turn
@@ -366,13 +433,22 @@ def _check(camera: OwnCamera) -> None:
         image = f"an image of {keys.width} × {keys.height} px before its corners, with this matrix"
         raise ValueError(f"distortion {list(D)} folds {image}; take them from one calibration")
     squares = np.linspace(0.0, min(edge**2, last))
-    if (moved := (np.abs(stretch(D, squares) - 1.0) + tangential * np.sqrt(squares)).max()) > MAX_MOVED:
+    if (
+        moved := (np.abs(stretch(D, squares) - 1.0) + tangential * np.sqrt(squares)).max()
+    ) > MAX_MOVED:
         much = f"moves points by {moved:.0%} of their distance from the middle; coefficients"
-        remark(f"distortion {list(D)} {much} of OpenCV are no percent, and {', '.join(LENSES[camera.lens])}")
+        remark(
+            f"distortion {list(D)} {much} of OpenCV are no percent, and {', '.join(LENSES[camera.lens])}"
+        )
     if camera.second is not None:
-        pair = [(each.keys.width, each.keys.height, each.keys.pose.frame) for each in (camera, camera.second)]
+        pair = [
+            (each.keys.width, each.keys.height, each.keys.pose.frame)
+            for each in (camera, camera.second)
+        ]
         if pair[0] != pair[1]:
-            raise ValueError(f"{keys.second}, the second camera, must have the same width, height and pose.frame")
+            raise ValueError(
+                f"{keys.second}, the second camera, must have the same width, height and pose.frame"
+            )
         if fisheye != (camera.second.lens == "equidistant"):
             raise ValueError(
                 f"{keys.second}, the second camera, must be a fisheye (equidistant) where the first is one"

@@ -26,9 +26,16 @@ NAMES: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names
 }  # fmt: skip
 SIZES: Final = ("ImageSize", "image_size", "resolution")  # width and height
 PROJECTIONS: Final = ("camera_model", "model_type", "Camera.type")
-PINHOLES: Final = ("pinhole", "pinholefull", "perspective", "opencv")  # projections with any distortion
-FOCAL_NAMES: Final = (("fx", "fy", "cx", "cy"), ("fl_x", "fl_y", "cx", "cy"), ("mu", "mv", "u0", "v0"))
-LENSES: Final[Mapping[str, tuple[str, ...]]] = {  # ROS's name of a model -> coefficients of OpenCV, in its order
+# Projections with any distortion
+PINHOLES: Final = ("pinhole", "pinholefull", "perspective", "opencv")
+FOCAL_NAMES: Final = (
+    ("fx", "fy", "cx", "cy"),
+    ("fl_x", "fl_y", "cx", "cy"),
+    ("mu", "mv", "u0", "v0"),
+)
+LENSES: Final[
+    Mapping[str, tuple[str, ...]]
+] = {  # ROS's name of a model -> coefficients of OpenCV, in its order
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
     "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "equidistant": ("k1", "k2", "k3", "k4"),
@@ -36,8 +43,11 @@ LENSES: Final[Mapping[str, tuple[str, ...]]] = {  # ROS's name of a model -> coe
 FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
 PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
 # In names of keys, or whole names.
-DISTORTION: Final = re.compile(r"dist(?!ance)|coeff|radial|tangential|^kc$|^[kp]_?\d$", re.IGNORECASE)
-NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]\.\d+")  # that PyYAML takes for texts
+DISTORTION: Final = re.compile(
+    r"dist(?!ance)|coeff|radial|tangential|^kc$|^[kp]_?\d$", re.IGNORECASE
+)
+# That PyYAML takes for texts
+NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]\.\d+")
 
 
 def plain_name(text: str) -> str:
@@ -60,18 +70,23 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
         given = {name: _data(found[name]) for name in names if name in found}
         for name, value in given.items():
             if value != keys.setdefault(key, value):
-                raise ValueError(f"{path.name} has {next(iter(given))} and another {name}; leave one out")
+                raise ValueError(
+                    f"{path.name} has {next(iter(given))} and another {name}; leave one out"
+                )
     _check_part(path, found, keys)
     projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
     if projection and "matrix" not in keys:
-        raise ValueError(f"{path.name} is of the projection {projection!r}, which is not known or lacks its numbers")
+        raise ValueError(
+            f"{path.name} is of the projection {projection!r}, which is not known or lacks its numbers"
+        )
     for name in ("width", "height", "matrix"):
         if name not in keys:
             raise ValueError(f"{path.name} has no {NAMES[name][0]}")
     if "distortion" not in keys and (other := _distortions(found)):
         raise ValueError(f"{path.name} has {other[0]!r}; wanted the name distortion_coefficients")
     if "distortion_model" in keys:
-        keys["distortion_model"] = keys["distortion_model"] or "none"  # an empty one stands for none in ROS
+        # An empty one stands for none in ROS
+        keys["distortion_model"] = keys["distortion_model"] or "none"
     if projection and plain_name(projection) not in PINHOLES:
         keys["distortion_model"] = projection
     if found.get("fisheye_model"):
@@ -100,17 +115,27 @@ def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
         Loader.add_constructor(f"tag:yaml.org,2002:{tag}", mapping)
     text = read_text("file", path)
     if text.lstrip().startswith("<"):
-        raise ValueError(f"{path.name} is XML; wanted YAML, which OpenCV writes where the name ends in .yml")
+        raise ValueError(
+            f"{path.name} is XML; wanted YAML, which OpenCV writes where the name ends in .yml"
+        )
     try:
-        documents = yaml.load_all(text.partition("\n")[2] if text.startswith("%YAML") else text, Loader)
+        documents = yaml.load_all(
+            text.partition("\n")[2] if text.startswith("%YAML") else text, Loader
+        )
         return next(documents, None)  # `ros2 topic echo` puts --- after each message
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
+        raise ValueError(
+            f"{path.name} is not valid YAML: {' '.join(str(error).split())}"
+        ) from error
 
 
 def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:
     """Return the first camera of a chain of kalibr, and the keys of any other file as they are."""
-    cameras = [name for name in found if re.fullmatch(r"cam\d+", str(name)) and isinstance(found[name], dict)]
+    cameras = [
+        name
+        for name in found
+        if re.fullmatch(r"cam\d+", str(name)) and isinstance(found[name], dict)
+    ]
     if not cameras:
         return found
     if len(cameras) > 1:
@@ -139,7 +164,10 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
         keys.setdefault("camera_matrix", [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
     given = {name: keys[name] for name in LENSES["rational_polynomial"] if name in keys}
     if "mu" in keys:
-        given = {name: keys.get(other, 0.0) for name, other in zip(LENSES["equidistant"], FISHEYE_OF_VINS, strict=True)}
+        given = {
+            name: keys.get(other, 0.0)
+            for name, other in zip(LENSES["equidistant"], FISHEYE_OF_VINS, strict=True)
+        }
     if given and not any(name in keys for name in NAMES["distortion"]):
         keys["distortion_coefficients"] = given
     return keys

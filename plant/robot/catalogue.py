@@ -32,7 +32,8 @@ ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
 } | {"panda": panda}
 """The arms by their makers' tables; each is made once."""
 WITH: Final = " with "  # between a robot and the file of its camera
-SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf", ".xacro")  # that files of robots have, and one that is refused
+# That files of robots have, and one that is refused
+SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf", ".xacro")
 
 
 def find_robot(text: str) -> Robot:
@@ -55,14 +56,18 @@ def find_robot(text: str) -> Robot:
     kind, _, number = text.partition(":")
     if kind == RANDOM_ARM:
         if not (number.isascii() and number.isdigit() and len(number) <= len(str(MAX_NUMBER))):
-            raise ValueError(f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7")
+            raise ValueError(
+                f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7"
+            )
         return random_robot(int(number))
     path = user_path(word.robot)
     if PurePath(text.partition("#")[0]).suffix.lower() == ".xacro":
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
         kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"
-        wanted = f"{suggest(text, ROBOTS)}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
+        wanted = (
+            f"{suggest(text, ROBOTS)}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
+        )
         raise ValueError(f"unknown robot {text!r}: {wanted}")
     return _read(text, _changed("robot", path))
 
@@ -84,7 +89,9 @@ class RobotWord(NamedTuple):
         """Return whether the parts look like a robot with a link and a camera, without a look at files."""
         if self.camera.lower().endswith(".urdf"):
             return False
-        return _is_robot_file(self.robot) or not (self.link or "/" in self.robot or "#" in self.robot)
+        return _is_robot_file(self.robot) or not (
+            self.link or "/" in self.robot or "#" in self.robot
+        )
 
 
 def read_word(text: str, is_there: Callable[[str], bool] = is_file) -> RobotWord:
@@ -105,7 +112,9 @@ def read_word(text: str, is_there: Callable[[str], bool] = is_file) -> RobotWord
         if camera
         for parts in divisions(robot, "#")
     ]
-    there = (each for each in [*whole, *equipped] if _is_robot_file(each.robot) and is_there(each.robot))
+    there = (
+        each for each in [*whole, *equipped] if _is_robot_file(each.robot) and is_there(each.robot)
+    )
     likely = (each for each in [*equipped, *whole[1:]] if each.is_likely())
     return next(there, None) or next(likely, whole[0])
 
@@ -114,7 +123,9 @@ def _is_robot_file(name: str) -> bool:
     return PurePath(name).suffix.lower() in SUFFIXES
 
 
-def with_files(text: str, change: Callable[[str], str], is_there: Callable[[str], bool] = is_file) -> str:
+def with_files(
+    text: str, change: Callable[[str], str], is_there: Callable[[str], bool] = is_file
+) -> str:
     """Return the text of a robot with the paths of robot and camera, or its name, changed; see `read_word`."""
     robot, link, camera = read_word(text, is_there)
     changed = change(robot)
@@ -155,7 +166,9 @@ def _read(text: str, changed: int) -> Robot:
     named = with_files(str(values["robot"]), locate, lambda file: is_file(locate(file)))
     base = user_path(read_word(named).robot)
     if base.suffix.lower() == ".toml" and "robot" in read_toml("robot file", base):
-        raise ValueError(f"twin {path}: its robot must be the one that controllers know, got the twin {named}")
+        raise ValueError(
+            f"twin {path}: its robot must be the one that controllers know, got the twin {named}"
+        )
     robot = find_robot(named)
     twin = read_twin(path, values, robot.arm)
     return replace(robot, name=path.stem, title=f"{robot.title} twin", source=path.name, twin=twin)
@@ -180,7 +193,9 @@ def random_robot(number: int) -> Robot:
         ValueError: a number out of its bounds.
     """
     if not 0 <= number <= MAX_NUMBER:
-        raise ValueError(f"the number of a {RANDOM_ARM} must be from 0 to {MAX_NUMBER:,}, got {number}")
+        raise ValueError(
+            f"the number of a {RANDOM_ARM} must be from 0 to {MAX_NUMBER:,}, got {number}"
+        )
     generator = named_generator(number, RANDOM_ARM)
     n, name = int(generator.integers(JOINTS[0], JOINTS[1] + 1)), f"{RANDOM_ARM}_{number}"
     limits = JointLimits(np.full(n, -LIMIT), np.full(n, LIMIT), np.full(n, SPEED))
@@ -191,7 +206,9 @@ def random_robot(number: int) -> Robot:
         if workspace is not None:
             source, note = f"drawn from the number {number}", f"{name} has {n} joints"
             return Robot(name, name, source, arm, limits, links, workspace, note=note, known=False)
-    raise ValueError(f"none of {MAX_DRAWS} arms drawn for {name} can work at the bench; take another number")
+    raise ValueError(
+        f"none of {MAX_DRAWS} arms drawn for {name} can work at the bench; take another number"
+    )
 
 
 def _draw_arm(n: int, generator: np.random.Generator) -> SerialArm:

@@ -27,7 +27,15 @@ from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import as_array
 from servobench.plant.contract.faults import configuration_errors
-from servobench.plant.contract.settings import JointSpeed, Number, Positive, Usual, override, remark, settings
+from servobench.plant.contract.settings import (
+    JointSpeed,
+    Number,
+    Positive,
+    Usual,
+    override,
+    remark,
+    settings,
+)
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.makers import known_title, read_calibration, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
@@ -42,7 +50,10 @@ def read_calibrated_robot(path: Path) -> Robot:
     """
     title, deviation = known_title(read_calibration(path, np.zeros(3)), path)
     sheet = universal_robot(title)
-    source, measured = f"{path.name}, held against {sheet.source}", read_calibration(path, sheet.arm.tool)
+    source, measured = (
+        f"{path.name}, held against {sheet.source}",
+        read_calibration(path, sheet.arm.tool),
+    )
     within = f"its flange within {1e3 * deviation:.1f} mm of the data sheet's"
     roles = f"the true robot is the calibrated arm, controllers know the data sheet's {title}"
     note = f"{path.name} is the factory calibration of a {title} ({within}): {roles}"
@@ -96,17 +107,25 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
     """
     for key in REQUIRED:
         if key not in values:
-            raise ValueError(f"robot file {path}: the key {key!r} is missing; wanted {', '.join(REQUIRED)}")
+            raise ValueError(
+                f"robot file {path}: the key {key!r} is missing; wanted {', '.join(REQUIRED)}"
+            )
     if "convention" not in values:
-        remark(f'robot file {path} is read by the standard convention; write convention = "standard" or "modified"')
+        remark(
+            f'robot file {path} is read by the standard convention; write convention = "standard" or "modified"'
+        )
     table = override(f"robot file {path}", DhTable((), (), (), (), (), ()), values)
     with configuration_errors(f"robot file {path}: "):
         arm = with_ball(_arm_of(table))
         n = arm.n
-        given = (as_array(name, getattr(table, name), (n,)) for name in ("joint_lower", "joint_upper", "joint_speed"))
+        given = (
+            as_array(name, getattr(table, name), (n,))
+            for name in ("joint_lower", "joint_upper", "joint_speed")
+        )
         limits = JointLimits(*given)
         mass, torque = (
-            as_array(name, each, (n,)) if (each := getattr(table, name)) else None for name in ("mass", "torque")
+            as_array(name, each, (n,)) if (each := getattr(table, name)) else None
+            for name in ("mass", "torque")
         )
         links = estimate_links(arm, mass, torque)
         workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))

@@ -19,10 +19,12 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
 from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
 
-FEATURE = Channel(("x", "y", "z"), "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
+# The ball centre, camera frame
+FEATURE = Channel(("x", "y", "z"), "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))
 SERIES_ANGLE = 1e-3  # [rad] below it, sin(α/2)/α is a series
 ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
-WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are sought
+# Shares of the way to a posture at which features are sought
+WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)
 
 
 class RobotModel(ABC):
@@ -73,7 +75,9 @@ class RobotModel(ABC):
         """
 
     @abstractmethod
-    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray | None]:
+    def observe(
+        self, joint_position: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray, BoolArray | None]:
         """Return `feature`, `jacobian` and `valid`, all read-only, at the cost of one forward kinematics."""
 
     def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
@@ -122,7 +126,9 @@ def rotation_matrix(vector: npt.ArrayLike) -> FloatArray:
     square = (v[..., :1] * v[..., :1] + v[..., 1:2] * v[..., 1:2]) + v[..., 2:] * v[..., 2:]
     angle = np.sqrt(square)
     near, square = angle <= SERIES_ANGLE, angle**2
-    quotient = np.where(near, 0.5 - square / 48 + square**2 / 3840, np.sin(angle / 2) / (angle + near))
+    quotient = np.where(
+        near, 0.5 - square / 48 + square**2 / 3840, np.sin(angle / 2) / (angle + near)
+    )
     x, y, z = np.moveaxis(v * quotient, -1, 0)
     w = np.cos(angle / 2)[..., 0]
     xx, yy, zz, ww = x * x, y * y, z * z, w * w
@@ -188,7 +194,11 @@ class HandEyeModel(RobotModel):
 
     def to_camera(self, p_B: npt.ArrayLike) -> FloatArray:
         """Return points of the base frame in the camera frame, (..., 3) m."""
-        return np.asarray(np.vecmat(np.asarray(p_B, dtype=np.float64) - self.X_BC[..., :3, 3], self.X_BC[..., :3, :3]))
+        return np.asarray(
+            np.vecmat(
+                np.asarray(p_B, dtype=np.float64) - self.X_BC[..., :3, 3], self.X_BC[..., :3, :3]
+            )
+        )
 
     def to_base(self, p_C: npt.ArrayLike) -> FloatArray:
         """Return points of the camera frame in the base frame, (..., 3) m."""
@@ -208,7 +218,11 @@ class TrueJacobian:
 
 
 def hand_eye_spec(
-    model: RobotModel, period: float, max_joint_speed: float, joint_range: float, limits: JointLimits | None = None
+    model: RobotModel,
+    period: float,
+    max_joint_speed: float,
+    joint_range: float,
+    limits: JointLimits | None = None,
 ) -> PlantSpec:
     """Return the spec of a plant built on `model`.
 

@@ -33,7 +33,9 @@ SHRINK, GROW = 0.3, 4.0  # factors on the damping after an accepted and after a 
 Limits = tuple[FloatArray, FloatArray]  # lower and upper joint positions, (n,) and (n,) [rad]
 
 
-def closest_distance(arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike) -> FloatArray:
+def closest_distance(
+    arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike
+) -> FloatArray:
     """Return the distance to which the ball can approach a point.
 
     Args:
@@ -47,9 +49,13 @@ def closest_distance(arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike,
     """
     target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
     lead, n = target.shape[:-1], len(low)  # all points have the same starts, within a turn
-    drawn = np.random.default_rng(0).uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi), (STARTS, n))
+    drawn = np.random.default_rng(0).uniform(
+        np.maximum(low, -np.pi), np.minimum(high, np.pi), (STARTS, n)
+    )
     starts = np.broadcast_to(drawn.reshape(STARTS, *(1,) * len(lead), n), (STARTS, *lead, n))
-    _, distance = _search(arm, target, starts, (low, high), lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH)
+    _, distance = _search(
+        arm, target, starts, (low, high), lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH
+    )
     return np.asarray(distance.min(axis=0))
 
 
@@ -73,13 +79,21 @@ def reach_for(
 
 
 def _search(
-    arm: SerialArm, target: FloatArray, q: FloatArray, limits: Limits, find: Callable[[FloatArray], BoolArray]
+    arm: SerialArm,
+    target: FloatArray,
+    q: FloatArray,
+    limits: Limits,
+    find: Callable[[FloatArray], BoolArray],
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint positions (starts, ..., n) rad near targets (..., 3) m, and their distances from it (starts, ...) m.
 
     The search begins at `q`, (starts, ..., n) rad, and ends for those of which `find` says so of the distances.
     """
-    lead, q, target = arm.translation.ndim - 2, q.copy(), np.broadcast_to(target, (*q.shape[:-1], 3))
+    lead, q, target = (
+        arm.translation.ndim - 2,
+        q.copy(),
+        np.broadcast_to(target, (*q.shape[:-1], 3)),
+    )
     error, J = _error(arm, target, q)
     distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
     for _ in range(ITERATIONS):
@@ -104,20 +118,30 @@ def _error(arm: SerialArm, target: FloatArray, q: FloatArray) -> tuple[FloatArra
 
 
 def _step(
-    q: FloatArray, error: FloatArray, J: FloatArray, damping: FloatArray, lower: FloatArray, upper: FloatArray
+    q: FloatArray,
+    error: FloatArray,
+    J: FloatArray,
+    damping: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
 ) -> FloatArray:
     """Return the joint positions after a damped step, (..., n) rad, within the limits."""
     downhill = np.vecmat(error, J)
     free = ~((q <= lower) & (downhill < 0.0) | (q >= upper) & (downhill > 0.0))
     J = J * free[..., None, :]
-    weighted = np.linalg.solve(plus_diagonal(J @ J.mT, damping[..., None]), error[..., None])[..., 0]
+    weighted = np.linalg.solve(plus_diagonal(J @ J.mT, damping[..., None]), error[..., None])[
+        ..., 0
+    ]
     return np.asarray(np.clip(q + np.vecmat(weighted, J), lower, upper))
 
 
 POSE_ITERATIONS: Final = 100
-POSE_TOLERANCE: Final = 1e-9  # error norm at which the search ends; lengths over the arm's, angles in rad
+POSE_TOLERANCE: Final = (
+    1e-9  # error norm at which the search ends; lengths over the arm's, angles in rad
+)
 FIRST_POSE_DAMPING: Final = 1e-3
-POSE_SHRINK, POSE_GROW = 0.2, 5.0  # factors on the damping after an accepted and after a rejected step
+# Factors on the damping after an accepted and after a rejected step
+POSE_SHRINK, POSE_GROW = (0.2, 5.0)
 
 
 def reach_pose(
@@ -151,7 +175,9 @@ def reach_pose(
     return q, float(np.linalg.norm(error))
 
 
-def _pose_error(arm: SerialArm, pose: FloatArray, q: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+def _pose_error(
+    arm: SerialArm, pose: FloatArray, q: FloatArray, length: float
+) -> tuple[FloatArray, FloatArray]:
     """Return the error, (6,), and the geometric Jacobian, (6, n), with lengths over that of the arm."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
@@ -159,4 +185,6 @@ def _pose_error(arm: SerialArm, pose: FloatArray, q: FloatArray, length: float) 
     flange, axes = frames[-1], frames[: arm.n, :3, 2] * arm.gear_ratio[:, None]
     turn = Rotation.from_matrix(pose[:3, :3] @ flange[:3, :3].T).as_rotvec()
     moves = np.cross(axes, flange[:3, 3] - frames[: arm.n, :3, 3]) / length
-    return np.concatenate([(pose[:3, 3] - flange[:3, 3]) / length, turn]), np.vstack([moves.T, axes.T])
+    return np.concatenate([(pose[:3, 3] - flange[:3, 3]) / length, turn]), np.vstack(
+        [moves.T, axes.T]
+    )

@@ -23,7 +23,13 @@ from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
-from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, length_scale, with_ball
+from servobench.plant.robot.workspace import (
+    CENTRE,
+    Workspace,
+    find_workspace,
+    length_scale,
+    with_ball,
+)
 
 Triple = tuple[float, float, float]
 CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -51,18 +57,25 @@ class UniversalRobot:
 
     def arm(self) -> SerialArm:
         """Return the nominal arm without a ball."""
-        a, d = (0.0, self.a2, self.a3, 0.0, 0.0, 0.0), (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6)
+        a, d = (
+            (0.0, self.a2, self.a3, 0.0, 0.0, 0.0),
+            (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6),
+        )
         return arm_from_dh(a, d, ur5.DH_ALPHA, ur5.JOINT_NAMES)
 
 
-UNIVERSAL_ROBOTS: Final = {title: UniversalRobot(**row) for title, row in ur5.ARMS["universal_robots"].items()}
+UNIVERSAL_ROBOTS: Final = {
+    title: UniversalRobot(**row) for title, row in ur5.ARMS["universal_robots"].items()
+}
 
 
 @cache
 def universal_robot(title: str) -> Robot:
     """Return an arm of Universal Robots by its title, such as "UR10e"."""
     row = UNIVERSAL_ROBOTS[title]
-    limits = JointLimits(np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(np.repeat(row.speed, ALIKE)))
+    limits = JointLimits(
+        np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(np.repeat(row.speed, ALIKE))
+    )
     if title == "UR5":
         return _ur5(row, limits)
     arm = with_ball(row.arm())
@@ -77,12 +90,21 @@ def universal_robot(title: str) -> Robot:
 
 def _ur5(row: UniversalRobot, limits: JointLimits) -> Robot:
     """Return the UR5, with the workspace of its sheet."""
-    bodies = ur5.MASS, ur5.CENTRE_OF_MASS, ur5.INERTIA, ur5.MAX_TORQUE, ur5.TUBE_RADIUS, ur5.SIDE_STEP
+    bodies = (
+        ur5.MASS,
+        ur5.CENTRE_OF_MASS,
+        ur5.INERTIA,
+        ur5.MAX_TORQUE,
+        ur5.TUBE_RADIUS,
+        ur5.SIDE_STEP,
+    )
     mass, middle, inertia, torque, radius, aside = map(np.array, bodies)
     links = Links(mass, middle, inertia, torque, radius, aside, row.payload)
     places = CENTRE, ur5.SHOULDER, ur5.HOME, ur5.TRAINING_LOWER, ur5.TRAINING_UPPER, ur5.STRETCHED
     centre, shoulder, home, lower, upper, stretched = map(np.array, places)
-    moves = {name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()}
+    moves = {
+        name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()
+    }
     workspace = Workspace(1.0, centre, shoulder, home, lower, upper, moves, stretched)
     return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
 
@@ -93,7 +115,9 @@ def panda() -> Robot:
     facts, joints = ur5.ARMS["panda"], tuple(f"joint_{i}" for i in range(1, 8))
     arm = with_ball(arm_from_dh(facts["a"], facts["d"], facts["alpha"], joints, modified=True))
     limits = JointLimits(*(np.array(facts[name]) for name in ("lower", "upper", "speed")))
-    inertia = np.array([[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]])
+    inertia = np.array(
+        [[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]]
+    )
     radius, aside = np.array(facts["radius"]), np.zeros(7)
     bodies = at_far_end(arm, np.array(facts["centre"]), inertia)
     links = Links(np.array(facts["mass"]), *bodies, np.array(facts["torque"]), radius, aside, 3.0)
@@ -101,7 +125,9 @@ def panda() -> Robot:
     return Robot("panda", "Panda", PANDA_SOURCE, arm, limits, links, workspace)
 
 
-MAX_DEVIATION: Final = 0.02  # [m] of a calibrated length from the data sheet; real ones differ by a millimetre or two
+MAX_DEVIATION: Final = (
+    0.02  # [m] of a calibrated length from the data sheet; real ones differ by a millimetre or two
+)
 
 
 def measured_arm(robot: Robot, file: str | None) -> SerialArm:
@@ -121,7 +147,9 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
         raise ValueError(f"mismatch 'factory' needs {wanted}; use the axes links and joint_offsets")
     if file is None and robot.title != "UR5":
         other = f"the calibration of one real UR5, and the robot is a {robot.title}"
-        raise ValueError(f"mismatch 'factory' without a file is {other}; use factory=FILE with its own")
+        raise ValueError(
+            f"mismatch 'factory' without a file is {other}; use factory=FILE with its own"
+        )
     arm = read_calibration(None if file is None else user_path(file), robot.arm.tool)
     title, deviation = known_title(arm, file)
     if title != robot.title and deviation_from(arm, robot.title) > MAX_DEVIATION:
@@ -154,18 +182,38 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     text = read_text("calibration file", path)
     try:
         blocks = yaml.safe_load(text)["kinematics"]
-        table = np.array([[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS])
+        table = np.array(
+            [[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS]
+        )
     except yaml.YAMLError as error:
-        raise ValueError(f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}") from error
+        raise ValueError(
+            f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}"
+        ) from error
     except KeyError as error:
-        raise ValueError(f"calibration file {path} lacks {error}; wanted 'kinematics' with {wanted}") from error
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"calibration file {path} lacks {error}; wanted 'kinematics' with {wanted}"
+        ) from error
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         came = "holds something that is not a number where one is wanted"
         raise ValueError(f"calibration file {path} {came}: 'kinematics' has {wanted}") from error
     if not np.isfinite(table).all():
         raise ValueError(f"calibration file {path} holds a number that is not finite")
     n, rows = len(table), np.vstack([table, np.zeros(6)])  # the flange is where the last joint is
-    return SerialArm(ur5.JOINT_NAMES, rows[:, :3], rows[:, 3:], np.zeros(n), np.ones(n), as_array("tool", tool, (3,)))
+    return SerialArm(
+        ur5.JOINT_NAMES,
+        rows[:, :3],
+        rows[:, 3:],
+        np.zeros(n),
+        np.ones(n),
+        as_array("tool", tool, (3,)),
+    )
 
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:
@@ -186,10 +234,14 @@ def known_title(arm: SerialArm, file: object) -> tuple[str, float]:
     found = f"calibration file {file} fits no arm of Universal Robots"
     lengths, apart = nearest_lengths(arm)
     if apart <= MAX_DEVIATION:
-        sizes = ", ".join(f"{name} = {length:.4f}" for name, length in zip(LENGTHS, lengths.tolist(), strict=True))
+        sizes = ", ".join(
+            f"{name} = {length:.4f}" for name, length in zip(LENGTHS, lengths.tolist(), strict=True)
+        )
         looks = "looks like an arm of Universal Robots that is not in the catalogue"
         found = f"calibration file {file} {looks}: bring its URDF, or a DH table with {sizes} m"
-    raise ValueError(f"{found}; the {title} comes nearest, and its flange is {1e3 * deviation:.0f} mm away")
+    raise ValueError(
+        f"{found}; the {title} comes nearest, and its flange is {1e3 * deviation:.0f} mm away"
+    )
 
 
 def nearest_lengths(arm: SerialArm) -> tuple[FloatArray, float]:
@@ -199,7 +251,9 @@ def nearest_lengths(arm: SerialArm) -> tuple[FloatArray, float]:
     """
     places = []
     for a2, a3, d1, d4, d5, d6 in np.eye(len(LENGTHS)).tolist():
-        unit = arm_from_dh((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), ur5.DH_ALPHA, ur5.JOINT_NAMES)
+        unit = arm_from_dh(
+            (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), ur5.DH_ALPHA, ur5.JOINT_NAMES
+        )
         places.append(_flanges(unit).ravel())
     matrix, own = np.transpose(places), _flanges(arm).ravel()
     lengths = np.linalg.lstsq(matrix, own, rcond=None)[0]

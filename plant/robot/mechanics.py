@@ -19,7 +19,9 @@ from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
-MAX_PART: Final = 0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
+MAX_PART: Final = (
+    0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
+)
 # [rad/s] of a flexible tool: the closed form of its motion loses its digits below, and overflows far above.
 FREQUENCIES: Final = (0.1, 1e6)
 Motion: TypeAlias = tuple[FloatArray, FloatArray]
@@ -52,7 +54,9 @@ class MechanicsConfig:
         """Check the frequency."""
         low, high = FREQUENCIES
         if self.tool_frequency != 0.0 and not low <= self.tool_frequency <= high:
-            raise ValueError(f"tool_frequency must be 0 or from {low:g} to {high:g}, got {self.tool_frequency:g}")
+            raise ValueError(
+                f"tool_frequency must be 0 or from {low:g} to {high:g}, got {self.tool_frequency:g}"
+            )
 
     @property
     def geared(self) -> bool:
@@ -80,7 +84,9 @@ class MechanicsConfig:
     def driven_velocity(self, x: FloatArray, q: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return ẋ, (..., n) rad/s, for q̇ (..., n): 0 of a joint that is within its play."""
         g, speed = self.transmitted(q), self.slope(q) * velocity
-        return np.where(np.where(speed > 0.0, x <= g - self.backlash, x >= g + self.backlash), speed, 0.0)
+        return np.where(
+            np.where(speed > 0.0, x <= g - self.backlash, x >= g + self.backlash), speed, 0.0
+        )
 
     def swung(self, tool: Tool, before: Motion, after: Motion, time: float) -> Tool:
         """Return a flexible tool a time [s] later, in closed form for ṗ that is a parabola with the right distance.
@@ -89,7 +95,11 @@ class MechanicsConfig:
         """
         omega, sigma = self.tool_frequency, self.tool_damping * self.tool_frequency
         damped = math.sqrt(omega**2 - sigma**2)
-        left, c, s = math.exp(-sigma * time), math.cos(damped * time), math.sin(damped * time) / damped
+        left, c, s = (
+            math.exp(-sigma * time),
+            math.cos(damped * time),
+            math.sin(damped * time) / damped,
+        )
         (start, begin), (end, finish) = before, after
         bend = 3.0 * (begin + finish) - 6.0 * (end - start) / time
         drift = -2.0 * bend / (time**2 * omega**2)
@@ -105,7 +115,9 @@ class MechanicsConfig:
             ValueError: says so.
         """
         if self.tool_frequency > 0.0 and model.channel is not FEATURE:
-            raise ValueError("mechanics.tool_frequency needs the sensing position; leave it at 0 with other sensing")
+            raise ValueError(
+                "mechanics.tool_frequency needs the sensing position; leave it at 0 with other sensing"
+            )
 
 
 def transmitted(q: FloatArray, ripple: float | FloatArray, order: float) -> FloatArray:

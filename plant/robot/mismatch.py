@@ -87,7 +87,9 @@ class Mismatch:
                 bound = replace(magnitude, number=round(most / units[magnitude.unit], 9))
                 meant = likely_meant(magnitude.number, "" if magnitude.unit else "1", most.__gt__)
                 wanted = "below" if units is SHARE else "at most"
-                raise ValueError(f"{axis} must be at least 0 and {wanted} {bound}, got {magnitude}{meant}")
+                raise ValueError(
+                    f"{axis} must be at least 0 and {wanted} {bound}, got {magnitude}{meant}"
+                )
         _ = self.plant_settings
 
     @classmethod
@@ -114,7 +116,9 @@ class Mismatch:
     def __str__(self) -> str:
         """Return the text that `parse` reads, as it stands in the column `mismatch`."""
         profile = self.profile if self.calibration is None else f"{self.profile}={self.calibration}"
-        return "+".join([profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes])
+        return "+".join(
+            [profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes]
+        )
 
     def with_axis(self, axis: str, magnitude: Magnitude) -> Mismatch:
         """Return this mismatch with one axis added.
@@ -128,7 +132,11 @@ class Mismatch:
     def size(self, axis: str) -> float:
         """Return the magnitude of an axis in SI units [rad, m or 1] or in pixels; 0 where it is not given."""
         given = dict(self.axes)
-        return given[axis].size(axis) if axis in given else PROFILES.get(self.profile, {}).get(axis, 0.0)
+        return (
+            given[axis].size(axis)
+            if axis in given
+            else PROFILES.get(self.profile, {}).get(axis, 0.0)
+        )
 
     @property
     def moves_robot(self) -> bool:
@@ -145,9 +153,14 @@ class Mismatch:
         """
         sensed = [(axis, each) for axis, each in self.axes if axis in SENSOR_AXES]
         geared = [(axis, each) for axis, each in self.axes if axis in MECHANICS_AXES]
-        axes = [(axis, str(each), str(each) if each.unit in PIXELS else each.size(axis)) for axis, each in sensed]
+        axes = [
+            (axis, str(each), str(each) if each.unit in PIXELS else each.size(axis))
+            for axis, each in sensed
+        ]
         own = {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
-        return own | {f"mechanics.{MECHANICS_AXES[axis].setting}": each.size(axis) for axis, each in geared}
+        return own | {
+            f"mechanics.{MECHANICS_AXES[axis].setting}": each.size(axis) for axis, each in geared
+        }
 
     @property
     def camera_exact(self) -> bool:
@@ -166,12 +179,18 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         ValueError: an unknown axis, a malformed or an empty range, or a magnitude out of its bounds.
     """
     if axis not in AXES:
-        raise ValueError(f"unknown mismatch axis {axis!r} (a setting is as kinematic.lag): {suggest(axis, AXES)}")
+        raise ValueError(
+            f"unknown mismatch axis {axis!r} (a setting is as kinematic.lag): {suggest(axis, AXES)}"
+        )
     example = RANGES[re.sub("[0-9.]", "", AXES[axis][1])]
     number = r"[0-9]*\.?[0-9]+"
-    match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
+    match = re.fullmatch(
+        rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip()
+    )
     if match is None:
-        raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}={example}; got {text!r}")
+        raise ValueError(
+            f"{axis} needs begin:end:step with a unit, such as {axis}={example}; got {text!r}"
+        )
     numbers = [float(part) for part in re.split("[:/]", match[1])]
     if ":" in match[1]:
         numbers = _range(axis, text, *numbers)
@@ -193,7 +212,11 @@ def parse_range(name: str, text: str) -> list[float] | list[int]:
     """
     try:
         numbers = _range(name, text, *(float(part) for part in text.split(":")))
-        return [int(number) for number in numbers] if all(map(str.isdigit, text.split(":"))) else numbers
+        return (
+            [int(number) for number in numbers]
+            if all(map(str.isdigit, text.split(":")))
+            else numbers
+        )
     except (TypeError, OverflowError) as error:
         raise ValueError(f"the range {text!r} of {name} must be begin:end:step") from error
 
@@ -207,7 +230,9 @@ def _range(name: str, text: str, begin: float, end: float, step: float) -> list[
         raise ValueError(f"{where} is empty")
     values = [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
     if steps - math.floor(steps) > 1e-6:
-        raise ValueError(f"{where} must be begin:end:step, but its last step ends at {values[-1]:g}")
+        raise ValueError(
+            f"{where} must be begin:end:step, but its last step ends at {values[-1]:g}"
+        )
     return values
 
 
@@ -221,7 +246,9 @@ class MismatchSample:
     tool_offset: FloatArray  # (3,), m, in the flange frame
     camera_axis: FloatArray  # (3,), unit vector in the camera frame
     camera_angle: float  # rad
-    move_axis: FloatArray  # (3,), unit vector in the camera frame, of the move in the middle of the run
+    move_axis: (
+        FloatArray  # (3,), unit vector in the camera frame, of the move in the middle of the run
+    )
     move_angle: float  # rad
 
     def moved(self, model: RobotModel, robot: Robot) -> RobotModel | None:
@@ -233,10 +260,15 @@ class MismatchSample:
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists and floats, for JSON."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        }
 
 
-def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEyeModel, MismatchSample]:
+def sample_mismatch(
+    mismatch: Mismatch, robot: Robot, seed: int
+) -> tuple[HandEyeModel, MismatchSample]:
     """Draw a true robot.
 
     Args:
@@ -265,12 +297,20 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
         joint_offset=size("joint_offsets") * draw("joint_offsets", n),
         gear_ratio=factors("gear_ratio", n),
         tool_offset=size("tool") * draw("tool", 3),
-        camera_axis=draw_camera_axis(angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")),
+        camera_axis=draw_camera_axis(
+            angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")
+        ),
         camera_angle=angle if mismatch.camera_exact else float(angle * draw("camera_angle", 1)[0]),
-        move_axis=draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
+        move_axis=draw_camera_axis(
+            move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")
+        ),
         move_angle=move,
     )
-    arm = measured_arm(robot, mismatch.calibration) if mismatch.profile == "factory" else robot.measured or nominal.arm
+    arm = (
+        measured_arm(robot, mismatch.calibration)
+        if mismatch.profile == "factory"
+        else robot.measured or nominal.arm
+    )
     true = replace(
         arm,
         translation=arm.translation * sample.link_scale,
@@ -308,7 +348,9 @@ AXES = {
     "centre": (PIXELS, "10px"),
     "distortion": (SHARE, "10%"),
     "mount": (ANGLE, "5deg"),
-    **{name: (axis.units, axis.example) for name, axis in {**SENSOR_AXES, **MECHANICS_AXES}.items()},
+    **{
+        name: (axis.units, axis.example) for name, axis in {**SENSOR_AXES, **MECHANICS_AXES}.items()
+    },
 }
 RANGES = {
     "%": "0:30:10%", "deg": "0:180:30deg", "mm": "0:60:20mm", "px": "0:20:5px", "ms": "0:200:50ms", "": "1:2:0.5",
@@ -316,7 +358,9 @@ RANGES = {
 }  # fmt: skip
 
 
-def _profile(share: float, zeros: float, turn: float, tool: float, centre: float) -> dict[str, float]:
+def _profile(
+    share: float, zeros: float, turn: float, tool: float, centre: float
+) -> dict[str, float]:
     """Return the magnitudes of a profile; zeros (and mount) and turn in deg, tool in m, centre in px."""
     angles = {"joint_offsets": radians(zeros), "camera_rotation": radians(turn)}
     cameras = {"focal": share, "centre": centre, "distortion": share, "mount": radians(zeros)}
@@ -331,7 +375,12 @@ PROFILES: Final[dict[str, dict[str, float]]] = {
     "lab": _profile(0.008, 0.1, 8.0, 0.01, 2.0) | {"mount": radians(8.0)},
 }
 PROFILE_SETTINGS: Final[dict[str, dict[str, float]]] = {
-    "lab": {"command_delay": 0.005, "lag": 0.03, "sensing.latency": 0.095, "sensing.feature_noise": 0.0034}
+    "lab": {
+        "command_delay": 0.005,
+        "lag": 0.03,
+        "sensing.latency": 0.095,
+        "sensing.feature_noise": 0.0034,
+    }
 }
 """Defaults of plants that come with a profile, by dotted key [s, m]; sources of all numbers are in docs/plants.md."""
 USUAL_SHARE: Final = 0.3  # [1] beyond which a share without a unit is likely one of percent
@@ -384,7 +433,9 @@ class Magnitude:
 def _not_a_magnitude(axis: str, text: str) -> ValueError:
     units, example = AXES[axis]
     if re.fullmatch(r"\s*-\s*[0-9.]+\s*[a-z%]*\s*", text):
-        return ValueError(f"{axis} has no sign, as each robot draws one where there is one; got {text!r}")
+        return ValueError(
+            f"{axis} has no sign, as each robot draws one where there is one; got {text!r}"
+        )
     names = ", ".join(repr(unit) if unit else "none" for unit in units)
     wanted = f"a magnitude with one of the units {names}, such as {axis}={example}"
     return ValueError(f"mismatch axis {axis} needs {wanted}; got {text!r}")

@@ -60,12 +60,18 @@ class Robot:
     limits: JointLimits  # of its joints, by its maker
     links: Links  # masses and shapes
     workspace: Workspace  # where it works, and where the camera hangs
-    measured: SerialArm | None = None  # the arm as its factory measured it; None where only the nominal one is known
+    measured: SerialArm | None = (
+        None  # the arm as its factory measured it; None where only the nominal one is known
+    )
     note: str = ""  # a line for the user about assumptions; empty for none
     flaw: str = ""  # why the physics engines cannot move it; empty for a robot that they can
-    known: bool = True  # whether controllers may know it; of another one they know joints and features alone
+    known: bool = (
+        True  # whether controllers may know it; of another one they know joints and features alone
+    )
     camera: OwnCamera | None = None  # of the user, in place of the bench's; None for none
-    twin: Twin | None = None  # the true robot as identified from a log, in place of mismatches; None for none
+    twin: Twin | None = (
+        None  # the true robot as identified from a log, in place of mismatches; None for none
+    )
 
     @property
     def n(self) -> int:
@@ -106,7 +112,8 @@ TAPER: Final = 0.65  # radius of the last tube over that of the first
 TORQUE_FACTOR: Final = 1.5  # torque limit over the torque that holds the stretched arm
 LEAST_TORQUE: Final = 5.0  # [Nm]
 GRAVITY: Final = 9.81  # [m/s²]
-Bodies = tuple[FloatArray, FloatArray]  # centres of mass (n, 3) [m] and inertia (n, 3, 3) [kg m²] of links
+# Centres of mass (n, 3) [m] and inertia (n, 3, 3) [kg m²] of links
+Bodies = tuple[FloatArray, FloatArray]
 PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
 
 
@@ -124,7 +131,10 @@ def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> Bodie
 
 
 def estimate_links(
-    arm: SerialArm, mass: FloatArray | None = None, torque: FloatArray | None = None, bodies: Bodies | None = None
+    arm: SerialArm,
+    mass: FloatArray | None = None,
+    torque: FloatArray | None = None,
+    bodies: Bodies | None = None,
 ) -> Links:
     """Return links with their known values, and estimates in place of the rest.
 
@@ -134,7 +144,8 @@ def estimate_links(
         torque: (n,) Nm, largest of each joint, if known.
         bodies: centres of mass (n, 3) m and inertia (n, 3, 3) kg m², as `at_far_end` returns them, if known.
     """
-    length, n = norm(arm.translation[1:]), arm.n  # [m] of each joint from the next one, or the flange
+    # [m] of each joint from the next one, or the flange
+    length, n = (norm(arm.translation[1:]), arm.n)
     reach = float(length[1:].sum())
     radius = TUBE_SHARE * reach * np.linspace(1.0, TAPER, n)
     mass = DENSITY * np.pi * radius**2 * (length + 2.0 * radius) if mass is None else mass
@@ -151,6 +162,7 @@ def _holding_torque(length: FloatArray, mass: FloatArray, payload: float) -> Flo
     ends = np.cumsum(length)
     starts, middles = ends - length, ends - length / 2.0
     loads = [
-        float(mass[i:] @ (middles[i:] - start)) + payload * float(ends[-1] - start) for i, start in enumerate(starts)
+        float(mass[i:] @ (middles[i:] - start)) + payload * float(ends[-1] - start)
+        for i, start in enumerate(starts)
     ]
     return np.maximum(TORQUE_FACTOR * (GRAVITY * np.array(loads)), LEAST_TORQUE)

@@ -90,8 +90,12 @@ def ball_rates(
     """
     ball = frames[:, -1, :3] @ np.append(arm.tool, 1.0)
     turns = arm.motions(frames, ball[:, None])[:, 0]
-    axes = np.insert(frames[..., :3, :3], 0, np.eye(3), axis=1)  # columns; the i-th link is given in the i-th of them
-    rates = {name: model.arm.translation[row, axis] * axes[:, row, :, axis] for name, row, axis in _links(arm)}
+    # Columns; the i-th link is given in the i-th of them
+    axes = np.insert(frames[..., :3, :3], 0, np.eye(3), axis=1)
+    rates = {
+        name: model.arm.translation[row, axis] * axes[:, row, :, axis]
+        for name, row, axis in _links(arm)
+    }
     rates |= {name: axes[:, -1, :, axis] for axis, name in enumerate(TOOL)}
     for i, name in enumerate(arm.joint_names):
         rates[name], rates[f"zero_{name}"] = turns[:, i], turns[:, i] / arm.gear_ratio[i]
@@ -156,7 +160,9 @@ class Twin:
             ValueError: another sensing than that of the log, or a mismatch.
         """
         if sensing != self.keys.sensing:
-            raise ValueError(f"twin {self.path} was logged with the sensing {self.keys.sensing}, got {sensing}")
+            raise ValueError(
+                f"twin {self.path} was logged with the sensing {self.keys.sensing}, got {sensing}"
+            )
         if not exact:
             words = "leave the mismatch out, and axes, but for camera_move and those of sensor, gears and tool"
             raise ValueError(f"twin {self.path} draws its robot from a posterior: {words}")
@@ -165,18 +171,27 @@ class Twin:
     def times(self, seed: int) -> dict[str, float]:
         """Return the known ones of latency, delay and lag of a run by key of a plant [s], rounded to milliseconds."""
         drawn = self.values(seed)
-        given: dict[str, float] = {name: max(0, round(1e3 * drawn[name])) / 1e3 for name in TIMES if name in drawn}
+        given: dict[str, float] = {
+            name: max(0, round(1e3 * drawn[name])) / 1e3 for name in TIMES if name in drawn
+        }
         return {"sensing.latency": given.pop("latency"), **given}
 
     def plant_settings(self, config: Any, period: float) -> dict[str, Any]:  # noqa: ANN401 - of any plant
         """Return the settings of the mean, nested, of a plant with a configuration and a control `period` [s]."""
-        keys, times, unit = self.keys, self.times(0), "" if self.keys.sensing == "position" else "px"
+        keys, times, unit = (
+            self.keys,
+            self.times(0),
+            "" if self.keys.sensing == "position" else "px",
+        )
         sensing: dict[str, Any] = {"latency": times.pop("sensing.latency")}
         sensing |= {"drop_probability": keys.lost_frames, "outliers": keys.outliers}
         if keys.covariance:
             scale = float(np.sqrt(np.trace(keys.covariance) / len(keys.covariance)))
             shape = np.linalg.cholesky(np.array(keys.covariance)) / scale
-            sensing |= {"feature_noise": f"{scale}{unit}" if unit else scale, "noise_shape": shape.tolist()}
+            sensing |= {
+                "feature_noise": f"{scale}{unit}" if unit else scale,
+                "noise_shape": shape.tolist(),
+            }
         if keys.outliers > 0.0:
             sensing["outlier_size"] = f"{keys.outlier_size}{unit}" if unit else keys.outlier_size
         if (rate := keys.camera.rate) is not None and abs(rate * period - 1.0) > ROUNDED:
@@ -192,20 +207,34 @@ def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
     Raises:
         ValueError: an unknown key or parameter, or a value that cannot be used.
     """
-    keys, known, what = override(f"twin {path}", TwinFile(), values), parameter_names(arm), f"twin {path}"
+    keys, known, what = (
+        override(f"twin {path}", TwinFile(), values),
+        parameter_names(arm),
+        f"twin {path}",
+    )
     for name in (*keys.mean, *keys.parameters):
         if name not in known or (name in keys.mean and name in ("latency", *CAMERA)):
-            raise ValueError(f"{what}: {keys.robot} has no parameter {name!r} there{did_you_mean(name, known)}")
+            raise ValueError(
+                f"{what}: {keys.robot} has no parameter {name!r} there{did_you_mean(name, known)}"
+            )
     if keys.camera.pose.frame != "base":
         raise ValueError(f'{what}: camera.pose must have frame = "base", position and rotation')
     if any(len(row) != len(keys.parameters) for row in keys.factor):
-        raise ValueError(f"{what}: each row of factor needs {len(keys.parameters)} numbers, one for each parameter")
+        raise ValueError(
+            f"{what}: each row of factor needs {len(keys.parameters)} numbers, one for each parameter"
+        )
     sizes = [float(np.linalg.norm(column)) for column in zip(*keys.factor, strict=True)]
     for name, value in (*keys.mean.items(), *zip(keys.parameters, sizes, strict=False)):
         if abs(value) > MAX_DEVIATION and not name.startswith("centre_"):
-            remark(f"{what}: {name} deviates by {value:g}, and usually by {MAX_DEVIATION:g} at most, in s, m, rad or 1")
+            remark(
+                f"{what}: {name} deviates by {value:g}, and usually by {MAX_DEVIATION:g} at most, in s, m, rad or 1"
+            )
     size = len(keys.covariance)
-    square = np.array(keys.covariance) if {len(row) for row in keys.covariance} == {size} else np.zeros((size, size))
+    square = (
+        np.array(keys.covariance)
+        if {len(row) for row in keys.covariance} == {size}
+        else np.zeros((size, size))
+    )
     if size and not (np.allclose(square, square.T) and np.linalg.eigvalsh(square)[0] > 0.0):
         raise ValueError(f"{what}: covariance must be a symmetric, positive definite matrix")
     return Twin(path, keys)

@@ -20,11 +20,17 @@ from servobench.plant.robot.files import Lengths
 
 TURNING: Final = ("revolute", "continuous")
 MIN_JOINTS: Final = 3  # least number of rotating joints of an arm
-FINGER: Final = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)  # in the name of a link or a joint
+# In the name of a link or a joint
+FINGER: Final = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)
 GRIPPER: Final = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)  # in that of a joint
-WRIST: Final = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)  # turns a whole gripper
-MAX_STROKE: Final = 0.1  # [m] longest travel of a sliding joint that is a finger without a name or a companion
-MIRRORED: Final = 0.01  # [1] largest relative difference of the distances of two fingers from their palm
+# Turns a whole gripper
+WRIST: Final = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)
+MAX_STROKE: Final = (
+    0.1  # [m] longest travel of a sliding joint that is a finger without a name or a companion
+)
+MIRRORED: Final = (
+    0.01  # [1] largest relative difference of the distances of two fingers from their palm
+)
 LENGTHS: Final = Check.of(Lengths, bare=True)
 Ways = dict[str, list[Any]]  # link -> joints from the root to it, as yourdfpy reads them
 
@@ -70,18 +76,28 @@ def find_chain(tree: Any, tip: str) -> Chain:  # noqa: ANN401 - yourdfpy is not 
     pose = np.eye(4)
     for joint in way:
         if not _is_modelled(joint):
-            kind = f"is of type {joint.type}" if joint.mimic is None else "turns with another (mimic)"
-            other = _flange({link: way for link, way in free.items() if all(map(_is_modelled, way))})
+            kind = (
+                f"is of type {joint.type}" if joint.mimic is None else "turns with another (mimic)"
+            )
+            other = _flange(
+                {link: way for link, way in free.items() if all(map(_is_modelled, way))}
+            )
             remedy = 'write type="fixed" if it can stay at rest'
             if _count(ways[other]) >= MIN_JOINTS:
                 remedy = f"name another link, such as #{other}"
-            raise ValueError(f"joint {joint.name!r} on the way to {tip!r} {kind}, which is not modelled; {remedy}")
+            raise ValueError(
+                f"joint {joint.name!r} on the way to {tip!r} {kind}, which is not modelled; {remedy}"
+            )
         place = pose_of(joint.origin)
-        read_value(f"joint {joint.name!r}: origin", tuple(place[:3, 3].tolist()), LENGTHS, lambda: "m")
+        read_value(
+            f"joint {joint.name!r}: origin", tuple(place[:3, 3].tolist()), LENGTHS, lambda: "m"
+        )
         pose = pose @ place
         if turns(joint):
             if not np.any(joint.axis):
-                raise ValueError(f"joint {joint.name!r} turns about the axis 0 0 0; the usual one is 0 0 1")
+                raise ValueError(
+                    f"joint {joint.name!r} turns about the axis 0 0 0; the usual one is 0 0 1"
+                )
             aligned = _along(np.asarray(joint.axis, dtype=np.float64))
             chain.append(Joint(joint, pose @ aligned, aligned))
             pose = aligned.T
@@ -99,16 +115,24 @@ def _ways(tree: Any) -> Ways:  # noqa: ANN401
     for joint in tree.joints:
         lost = {joint.parent, joint.child} - set(links)
         if lost:
-            raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(lost)!r}")
+            raise ValueError(
+                f"joint {joint.name!r} is between links of which the file has no {min(lost)!r}"
+            )
     if not links or not tree.joints:
-        raise ValueError("it has no links and joints; of a xacro file, take the output of `xacro FILE`")
+        raise ValueError(
+            "it has no links and joints; of a xacro file, take the output of `xacro FILE`"
+        )
     roots = sorted(ends - set(above))
     if len(roots) > 1:
-        raise ValueError(f"both {' and '.join(roots)} are without a parent: a joint is missing or turned round")
+        raise ValueError(
+            f"both {' and '.join(roots)} are without a parent: a joint is missing or turned round"
+        )
     for joint in tree.joints:
         other = above[joint.child]
         if other is not joint:
-            raise ValueError(f"link {joint.child!r} is the child of both {joint.name!r} and {other.name!r}")
+            raise ValueError(
+                f"link {joint.child!r} is the child of both {joint.name!r} and {other.name!r}"
+            )
     lonely = [link for link in links if link not in ends]
     if lonely:
         remark(f"links without a joint are left out: {listed(lonely, 6)}")
@@ -140,9 +164,15 @@ def _is_modelled(joint: Any) -> bool:  # noqa: ANN401
 
 def _flange(ways: Ways) -> str:
     """Return the link that is fixed to the last of the most rotating ones; that one itself if there is none."""
-    last = max(ways, key=lambda name: (_count(ways[name]), bool(ways[name]) and turns(ways[name][-1])))
+    last = max(
+        ways, key=lambda name: (_count(ways[name]), bool(ways[name]) and turns(ways[name][-1]))
+    )
     # Fingers and cameras follow after the flange; ROS puts the frame of a force sensor before it.
-    fixed = [name for name, way in ways.items() if way and way[:-1] == ways[last] and way[-1].type == "fixed"]
+    fixed = [
+        name
+        for name, way in ways.items()
+        if way and way[:-1] == ways[last] and way[-1].type == "fixed"
+    ]
     return "flange" if "flange" in fixed else fixed[0] if fixed else last
 
 
@@ -160,7 +190,9 @@ def _tool(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
             continue
         if followers[joint.name]:
             tool[joint.name] = f"mimicked by {followers[joint.name]}"
-        elif (GRIPPER.search(joint.name) or FINGER.search(joint.child)) and not WRIST.search(joint.name):
+        elif (GRIPPER.search(joint.name) or FINGER.search(joint.child)) and not WRIST.search(
+            joint.name
+        ):
             tool[joint.name] = "by its name"
     return tool
 
@@ -227,9 +259,20 @@ def _ending(tree: Any, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) -
     lines = []
     if following:
         why = [f"{joint.name} ({_reason(joint, tool)})" for joint in following]
-        taken = next((f"; #{joint.child} would take it as a joint" for joint in following if joint.name in tool), "")
+        taken = next(
+            (
+                f"; #{joint.child} would take it as a joint"
+                for joint in following
+                if joint.name in tool
+            ),
+            "",
+        )
         lines.append(f"the tool, at rest, begins with {listed(why, 3)}{taken}")
-    equal = [link for link, way in free.items() if way and turns(way[-1]) and _count(way) == _count(ways[tip])]
+    equal = [
+        link
+        for link, way in free.items()
+        if way and turns(way[-1]) and _count(way) == _count(ways[tip])
+    ]
     others = [f"#{link}" for link in equal if link != last.child]
     if others:
         lines.append(f"as many joints lead to {listed(others, 3)}")
@@ -244,7 +287,11 @@ def _reason(joint: Any, tool: dict[str, str]) -> str:  # noqa: ANN401
 
 def _is_axis(joint: Any) -> bool:  # noqa: ANN401
     """Return whether a single sliding joint at the end of a chain is an axis of the arm and no finger."""
-    if joint.type != "prismatic" or joint.mimic is not None or GRIPPER.search(f"{joint.name} {joint.child}"):
+    if (
+        joint.type != "prismatic"
+        or joint.mimic is not None
+        or GRIPPER.search(f"{joint.name} {joint.child}")
+    ):
         return False
     if joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
         return True

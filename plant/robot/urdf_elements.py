@@ -24,8 +24,12 @@ from servobench.plant.contract.settings import listed, remark, suggest
 from servobench.plant.robot.arm import rpy_from_rotation
 
 RUN_XACRO: Final = "run xacro first, and give what it prints: `xacro FILE > arm.urdf`"
-READ_QUATERNION: Final = 'quat_xyzw of <origin>, which is read; ROS reads it in <robot version="1.1"> only'
-ATTRIBUTES: Final[Mapping[str, Mapping[str, int]]] = {  # element -> its attributes -> count of numbers, 0 for a text
+READ_QUATERNION: Final = (
+    'quat_xyzw of <origin>, which is read; ROS reads it in <robot version="1.1"> only'
+)
+ATTRIBUTES: Final[
+    Mapping[str, Mapping[str, int]]
+] = {  # element -> its attributes -> count of numbers, 0 for a text
     "link": {"name": 0, "type": 0},
     "inertial": {},
     "mass": {"value": 1},
@@ -35,18 +39,44 @@ ATTRIBUTES: Final[Mapping[str, Mapping[str, int]]] = {  # element -> its attribu
     "child": {"link": 0},
     "origin": {"xyz": 3, "rpy": 3, "quat_xyzw": 4},
     "axis": {"xyz": 3},
-    "limit": {"lower": 1, "upper": 1, "effort": 1, "velocity": 1, "acceleration": 1, "deceleration": 1, "jerk": 1},
+    "limit": {
+        "lower": 1,
+        "upper": 1,
+        "effort": 1,
+        "velocity": 1,
+        "acceleration": 1,
+        "deceleration": 1,
+        "jerk": 1,
+    },
     "mimic": {"joint": 0, "multiplier": 1, "offset": 1},
-    "safety_controller": {"soft_lower_limit": 1, "soft_upper_limit": 1, "k_position": 1, "k_velocity": 1},
+    "safety_controller": {
+        "soft_lower_limit": 1,
+        "soft_upper_limit": 1,
+        "k_position": 1,
+        "k_velocity": 1,
+    },
 }
 CHILDREN: Final[Mapping[str, tuple[str, ...]]] = {  # element -> known elements in it
     "link": ("inertial", "visual", "collision", "contact"),
     "inertial": ("origin", "mass", "inertia"),
-    "joint": ("parent", "child", "origin", "axis", "limit", "mimic", "safety_controller", "dynamics", "calibration"),
+    "joint": (
+        "parent",
+        "child",
+        "origin",
+        "axis",
+        "limit",
+        "mimic",
+        "safety_controller",
+        "dynamics",
+        "calibration",
+    ),
 }
 ENDS: Final = ("parent", "child")
-GEOMETRY: Final = ("origin", "axis", "limit", "mimic")  # elements of a joint whose values are geometry
-SIMILAR: Final[Mapping[str, tuple[str, ...]]] = {  # element -> likely meanings of an unknown element in it
+# Elements of a joint whose values are geometry
+GEOMETRY: Final = ("origin", "axis", "limit", "mimic")
+SIMILAR: Final[
+    Mapping[str, tuple[str, ...]]
+] = {  # element -> likely meanings of an unknown element in it
     "robot": ("link", "joint"),
     "link": ("link", "joint"),
     "inertial": ("origin",),
@@ -56,27 +86,26 @@ REQUIRED: Final = {"parent": "link", "child": "link", "mimic": "joint", "axis": 
 LIMITING: Final = ("limit", "safety_controller")  # elements whose numbers may be infinite
 TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 MOMENTS: Final = {"ixx", "iyy", "izz"}
-OF_OTHERS: Final = (
-    "material",
-    "gazebo",
-    "transmission",
-    "ros2_control",
-    "sensor",
-)  # parts of a robot for other programs
-OF_XACRO: Final = ("property", "macro", "include", "insert_block", "if", "unless", "arg")  # elements without a prefix
+# Parts of a robot for other programs
+OF_OTHERS: Final = ("material", "gazebo", "transmission", "ros2_control", "sensor")
+# Elements without a prefix
+OF_XACRO: Final = ("property", "macro", "include", "insert_block", "if", "unless", "arg")
 EXPRESSION: Final = re.compile(r"\$[{(].*?[})]")  # xacro would replace it
-DYNAMIC: Final = re.compile(
-    r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff"
-)  # in names of limits without geometry
+# In names of limits without geometry
+DYNAMIC: Final = re.compile(r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff")
 NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 INFINITE: Final = re.compile(r"[-+]?inf(inity)?", re.IGNORECASE)
 ZEROS: Final = re.compile(r"[-+.0\s]*")
 REMEDIES: Final = (  # mark in a word that is no number, and remedy
     (re.compile(r"[${}()*/]|pi"), RUN_XACRO),
     (re.compile(","), "numbers have a decimal point and blanks between them"),
-    (re.compile("[a-zA-Zµ°]"), "units cannot be written: lengths are in m, angles in rad, masses in kg"),
+    (
+        re.compile("[a-zA-Zµ°]"),
+        "units cannot be written: lengths are in m, angles in rad, masses in kg",
+    ),
 )
-TOLERATED: Final = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION", "ERR_RESERVED_XML_NAME")  # as ROS does
+# As ROS does
+TOLERATED: Final = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION", "ERR_RESERVED_XML_NAME")
 LIKENESS: Final = 0.75  # least ratio of difflib between a misspelt word and the one that is meant
 MAX_TURN: Final = 7.0  # [rad] largest usual angle of an rpy
 ROUNDED_UNIT: Final = 0.01  # largest deviation of a quaternion's norm from 1
@@ -91,7 +120,9 @@ def read_elements(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
     try:
         import yourdfpy  # noqa: PLC0415 - only the extra urdf brings it
     except ImportError as error:
-        raise ValueError(f"robot file {path}: a URDF needs yourdfpy: pip install 'servobench[urdf]'") from error
+        raise ValueError(
+            f"robot file {path}: a URDF needs yourdfpy: pip install 'servobench[urdf]'"
+        ) from error
     with accessing(path, "robot file", "read"):
         content = path.read_bytes()
     with configuration_errors(f"robot file {path} is no URDF: "):
@@ -127,7 +158,9 @@ def _parse(content: bytes) -> Any:  # noqa: ANN401 - lxml is not typed
         raise ValueError(" ".join(str(error).split())) from error
     for fault in parser.error_log:
         if fault.type_name not in TOLERATED:
-            raise ValueError(f"{' '.join(fault.message.split())}, line {fault.line}, column {fault.column}")
+            raise ValueError(
+                f"{' '.join(fault.message.split())}, line {fault.line}, column {fault.column}"
+            )
     if _tag(root) != "robot":
         raise ValueError(f"its root is <{_tag(root)}>, and that of a URDF is <robot>")
     return root
@@ -150,7 +183,9 @@ def _refuse_xacro(root: Any) -> None:  # noqa: ANN401
             if (tag in OF_XACRO and element is part) or (":" in tag and "xacro" in element.tag):
                 found = f"<{tag}>"
             elif _tag(part) not in OF_OTHERS:
-                found = "".join(EXPRESSION.findall(" ".join((*element.attrib.values(), element.text or ""))))
+                found = "".join(
+                    EXPRESSION.findall(" ".join((*element.attrib.values(), element.text or "")))
+                )
             if found:
                 raise ValueError(f"{found} in line {element.sourceline} is xacro: {RUN_XACRO}")
 
@@ -204,7 +239,9 @@ def _copy(source: Any, place: str, passed: dict[str, None]) -> ET.Element:  # no
             _check_numbers(f"{place}: {tag} {name}", text, known[name], infinite=tag in LIMITING)
             copy.set(name, text)
         elif _attribute_matters(source, name, text):
-            raise ValueError(f"{place}: {tag} has the attribute {name!r}; valid: {', '.join(known)}")
+            raise ValueError(
+                f"{place}: {tag} has the attribute {name!r}; valid: {', '.join(known)}"
+            )
         elif ":" not in name:
             passed[f"{name} of <{tag}>, which is left out"] = None
     text = (source.text or "").strip()
@@ -226,7 +263,9 @@ def _copy_part(part: Any, copy: ET.Element, place: str, passed: dict[str, None])
     known = CHILDREN.get(copy.tag, ())
     if tag not in known:
         if _element_matters(copy.tag, part):
-            raise ValueError(f"{place}: {copy.tag} has the element <{tag}>; valid: {', '.join(known) or 'none'}")
+            raise ValueError(
+                f"{place}: {copy.tag} has the element <{tag}>; valid: {', '.join(known) or 'none'}"
+            )
         passed[f"<{tag}> in <{copy.tag}>, which is left out"] = None
     elif tag in ATTRIBUTES:
         own = _copy(part, place, passed)
@@ -298,7 +337,9 @@ def _turn_by_quaternion(origin: ET.Element, place: str) -> None:
     if "rpy" in origin.attrib:
         raise ValueError(f"{place}: origin has both rpy and quat_xyzw; keep one")
     if abs(hypot(*quaternion) - 1.0) > ROUNDED_UNIT:
-        raise ValueError(f"{place}: origin quat_xyzw must have a norm of 1, got {hypot(*quaternion):.3g}")
+        raise ValueError(
+            f"{place}: origin quat_xyzw must have a norm of 1, got {hypot(*quaternion):.3g}"
+        )
     rpy = rpy_from_rotation(Rotation.from_quat(quaternion).as_matrix())
     origin.set("rpy", " ".join(map(repr, rpy.tolist())))
 

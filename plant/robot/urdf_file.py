@@ -27,10 +27,17 @@ UNLIMITED: Final = 1e3  # [rad], [rad/s] from which on a limit is none
 DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side of a joint whose limit is not given
 DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
 DEFAULTS: Final = "±2π rad and π rad/s"
-INERTIA_MARGIN: Final = 1e-6  # [1] of the largest moment, by which the others' sum is above it despite rounding
-ROUNDED_INERTIA: Final = 5e-3  # [1] of the largest moment, by which it exceeds the others' sum without a remark
-FLAT_INERTIA: Final = 0.9  # [1] of the largest moment, by which it exceeds the others' sum in no real file
-MAX_GYRATION: Final = 2.0 / 3.0  # [1] radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
+INERTIA_MARGIN: Final = (
+    1e-6  # [1] of the largest moment, by which the others' sum is above it despite rounding
+)
+ROUNDED_INERTIA: Final = (
+    5e-3  # [1] of the largest moment, by which it exceeds the others' sum without a remark
+)
+FLAT_INERTIA: Final = (
+    0.9  # [1] of the largest moment, by which it exceeds the others' sum in no real file
+)
+# [1] radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
+MAX_GYRATION: Final = 2.0 / 3.0
 MAX_DENSITY: Final = 22_600.0  # [kg/m³] of osmium, whose sphere has the least inertia of a mass
 
 
@@ -52,7 +59,9 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
         limits = _limits([link.joint for link in chain.joints])
         links, note = _links(tree, chain.joints, arm, flaws)
         try:
-            workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+            workspace = find_workspace(
+                arm, (limits.lower, limits.upper), (links.radius, links.aside)
+            )
         except ValueError as error:
             raise ValueError(f"{error}; {chain.ending}".removesuffix("; ")) from error
     flaw = ""
@@ -63,7 +72,9 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
     line = f"{path.name}: {arm.n} joints from {names[0]} to {names[-1]}, the ball on {chain.tip}"
     lines = [each for each in (line, chain.ending, note) if each]
     title = str(tree.name)
-    return Robot(path.stem, title, path.name, arm, limits, links, workspace, note="; ".join(lines), flaw=flaw)
+    return Robot(
+        path.stem, title, path.name, arm, limits, links, workspace, note="; ".join(lines), flaw=flaw
+    )
 
 
 def _arm(chain: Chain) -> SerialArm:
@@ -98,7 +109,9 @@ def _limits(joints: list[Any]) -> JointLimits:
         if max(-lower, upper) > USUAL_LIMIT:
             told["limits beyond ±4π rad; angles of a URDF are in rad"].append(joint.name)
         if not USUAL_SPEEDS[0] <= speed <= USUAL_SPEEDS[1]:
-            told["velocities that are usually from 0.01 to 20 rad/s; those of a URDF are in rad/s"].append(joint.name)
+            told[
+                "velocities that are usually from 0.01 to 20 rad/s; those of a URDF are in rad/s"
+            ].append(joint.name)
         rows.append((lower, upper, speed))
     for text, names in told.items():
         remark(f"{text}: {', '.join(names)}")
@@ -110,7 +123,9 @@ def _limit(joint: Any, word: str, default: float, told: dict[str, list[str]]) ->
     """Return a limit of a joint; the default where it is not given or infinite."""
     given = getattr(joint.limit, word, None)
     if given is None or (given == 0.0 and word == "velocity"):
-        told[f"limits that the URDF lacks are taken as {DEFAULTS}"].append(f"{word} of {joint.name}")
+        told[f"limits that the URDF lacks are taken as {DEFAULTS}"].append(
+            f"{word} of {joint.name}"
+        )
         return default
     if abs(given) == inf or (abs(given) >= UNLIMITED and word != "velocity"):
         told[f"unlimited in the URDF, and taken as {DEFAULTS}"].append(f"{word} of {joint.name}")
@@ -133,10 +148,14 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> t
     torque = None
     if all(isfinite(effort) and effort > 0.0 for effort in efforts):
         torque = np.array(efforts)
-    given = [inertial is not None and inertial.mass and np.any(inertial.inertia) for inertial in own]
+    given = [
+        inertial is not None and inertial.mass and np.any(inertial.inertia) for inertial in own
+    ]
     if not all(given):
         further = "" if torque is not None else ", torque limits"
-        lacking = ", ".join(link.joint.child for link, known in zip(chain, given, strict=True) if not known)
+        lacking = ", ".join(
+            link.joint.child for link, known in zip(chain, given, strict=True) if not known
+        )
         cause = f" (no mass or inertia of {lacking})" if any(given) else ""
         return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}{cause}"
     reach = float(np.linalg.norm(arm.translation[1:], axis=1).sum())
@@ -181,7 +200,9 @@ def _body(
             parts.append((name, float(own.mass), placed[:3, 3], R @ inertia @ R.T))
             away = float(np.linalg.norm(placed[:3, 3]))
             if away > reach:
-                flaws.append(f"link {name!r}: its centre of mass is {away:.3g} m from joint {link.joint.name!r}")
+                flaws.append(
+                    f"link {name!r}: its centre of mass is {away:.3g} m from joint {link.joint.name!r}"
+                )
     mass = sum(each for _, each, _, _ in parts)
     centre = np.sum([each * place for _, each, place, _ in parts], axis=0) / mass
     whole = np.zeros((3, 3))
@@ -203,7 +224,9 @@ def _implausible(link: str, mass: float, inertia: FloatArray, reach: float) -> l
     if least <= largest <= most:
         return []
     bounds = f"from {least:.2g} to {most:.2g} for {mass:.3g} kg on an arm of {reach:.2g} m"
-    return [f"link {link!r}: inertia is implausible, as its largest moment is {largest:.3g} kg m²; possible: {bounds}"]
+    return [
+        f"link {link!r}: inertia is implausible, as its largest moment is {largest:.3g} kg m²; possible: {bounds}"
+    ]
 
 
 def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
@@ -215,7 +238,9 @@ def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
     moments, axes = np.linalg.eigh(inertia)
     came = f"principal moments {', '.join(f'{moment:.3g}' for moment in moments)} kg m²"
     if not moments[0] > 0.0:
-        flaws.append(f"link {link!r}: inertia must be positive definite, got {came}; for an estimate write zeros")
+        flaws.append(
+            f"link {link!r}: inertia must be positive definite, got {came}; for an estimate write zeros"
+        )
         return np.zeros((3, 3))
     excess = (1.0 + INERTIA_MARGIN) * moments[2] - moments[0] - moments[1]
     if excess <= 0.0:
@@ -225,5 +250,7 @@ def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
     moments = moments + excess / (3.0 + INERTIA_MARGIN) * np.array([1.0, 1.0, -1.0])
     if excess > ROUNDED_INERTIA * moments[2]:
         taken = ", ".join(f"{moment:.3g}" for moment in moments)
-        remark(f"link {link!r}: no body has the {came}, one above the others' sum; taken as {taken}")
+        remark(
+            f"link {link!r}: no body has the {came}, one above the others' sum; taken as {taken}"
+        )
     return np.asarray(axes * moments @ axes.T)

@@ -27,7 +27,8 @@ from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 CENTRE: Final = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
 CAMERA_DISTANCE: Final = 1.3  # [m] from the camera to the workspace's centre, for a UR5
 BALL_RADIUS: Final = 0.035  # [m] for a UR5
-REACH: Final = (0.35, 0.75)  # [m] from a UR5's shoulder to the ball: away from the column and from the stretched arm
+# [m] from a UR5's shoulder to the ball: away from the column and from the stretched arm
+REACH: Final = (0.35, 0.75)
 # The camera hangs above the workspace and looks straight down; image up is +x of the base.
 R_BC_DOWN: Final = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
@@ -55,10 +56,17 @@ class Workspace:
     def __post_init__(self) -> None:
         """Check the shapes and freeze the arrays."""
         n = len(self.home)
-        shapes = {"centre": 3, "shoulder": 3, **dict.fromkeys(("home", "lower", "upper", "stretched"), n)}
+        shapes = {
+            "centre": 3,
+            "shoulder": 3,
+            **dict.fromkeys(("home", "lower", "upper", "stretched"), n),
+        }
         for name, size in shapes.items():
             object.__setattr__(self, name, as_array(name, getattr(self, name), (size,)))
-        moves = {name: tuple(as_array(name, end, (n,)) for end in ends) for name, ends in self.moves.items()}
+        moves = {
+            name: tuple(as_array(name, end, (n,)) for end in ends)
+            for name, ends in self.moves.items()
+        }
         object.__setattr__(self, "moves", moves)
 
     @property
@@ -94,7 +102,9 @@ HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius
 BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
 OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
 BUILT_IN: Final = 0.4  # share of random postures with overlap above which two tubes count as built into each other
-IMAGE_SHARE: Final = 0.8  # share of the image's half sides for the ball, with a margin for a turned camera
+IMAGE_SHARE: Final = (
+    0.8  # share of the image's half sides for the ball, with a margin for a turned camera
+)
 MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian; of a UR5
 STOP_MARGIN: Final = 0.25  # [rad] from a joint's stop
 
@@ -150,7 +160,9 @@ class Clearance:
             singular: allow a Jacobian that is nearly singular.
         """
         q = np.asarray(joint_position, dtype=np.float64)
-        fits = np.asarray(((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1))
+        fits = np.asarray(
+            ((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1)
+        )
         frames = self.arm.frames(q[fits])
         ball, placed = self.arm.ball(frames), self.tubes.placed(frames)
         good = (ball[:, 2] >= BALL_HEIGHT * self.scale) & self._above_table(placed)
@@ -180,7 +192,11 @@ class Clearance:
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
         p_C = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
-        half = IMAGE_SHARE * np.array([self.camera.width, self.camera.height]) / (2.0 * self.camera.focal)
+        half = (
+            IMAGE_SHARE
+            * np.array([self.camera.width, self.camera.height])
+            / (2.0 * self.camera.focal)
+        )
         inside = (np.abs(p_C[..., :2]) <= half * p_C[..., 2:]).all(axis=-1) & (p_C[..., 2] > 0.0)
         line = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
         free = segment_distance(placed, line[..., None, :, :]) - self.tubes.radius
@@ -206,7 +222,9 @@ def segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
     c, f = np.vecdot(d1, r), np.vecdot(d2, r)
     tiny = 1e-12
     denominator = a * e - b * b
-    s = np.where(denominator > tiny, np.clip((b * f - c * e) / np.maximum(denominator, tiny), 0.0, 1.0), 0.0)
+    s = np.where(
+        denominator > tiny, np.clip((b * f - c * e) / np.maximum(denominator, tiny), 0.0, 1.0), 0.0
+    )
     t = np.where(e > tiny, (b * s + f) / np.maximum(e, tiny), 0.0)
     clipped = np.clip(t, 0.0, 1.0)
     again = np.where(a > tiny, np.clip((b * clipped - c) / np.maximum(a, tiny), 0.0, 1.0), 0.0)
@@ -218,7 +236,8 @@ LENGTH_OF_UR5: Final = 1.10335  # [m] from its shoulder along the links to the f
 TOOL: Final = 0.10  # [m] from the flange to the ball; of a UR5
 HOME_POINT: Final = (0.5, 0.0, 0.3)  # [m] the ball at home; of a UR5
 STRETCHED_POINT: Final = (3.0, 0.0, 0.1)  # [m] out of reach: the arm points there; of a UR5
-HEIGHTS: Final = (0.0, 0.1, 0.2)  # [m] by which the workspace is lifted until enough postures are fit; of a UR5
+# [m] by which the workspace is lifted until enough postures are fit; of a UR5
+HEIGHTS: Final = (0.0, 0.1, 0.2)
 # The ball in the base frame of a UR5 at start and target of each move [m].
 MOVES: Final = {
     "exp1": ((0.50, -0.10, 0.35), (0.15, 0.58, 0.30)),
@@ -229,13 +248,16 @@ MOVES: Final = {
 
 STARTS: Final = 512  # starts of the search for a home
 CANDIDATES: Final = 12  # homes whose surroundings are sampled
-WINDING: Final = 0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
+WINDING: Final = (
+    0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
+)
 NEIGHBOURS: Final = 192  # sampled postures in a box
 NEAR_STARTS: Final = 96  # starts of the search for a posture near the home
 NEAR: Final = 0.4  # [rad] deviation of those starts from the home
 HALF_BOX: Final = 0.6  # [rad] half sides of the box
 LAST_HALF: Final = 0.3  # [rad] half side for the last joint, which moves the ball little
-SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)  # factors on the box until enough postures in it are fit
+# Factors on the box until enough postures in it are fit
+SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)
 ENOUGH: Final = 0.7  # share of fit postures in a box
 WAYS: Final = 24  # number of starts that are tried for a move
 WAY_STEPS: Final = 40  # steps on the path of a move
@@ -263,13 +285,23 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
     if arm.n < 3 or length_scale(arm) == 0.0:
         size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
         raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
-    look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
+    look = (
+        "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
+    )
     shift = arm.translation[0]
     heights = (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4)))
-    moved = [np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights if shift.any()]
-    if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
+    moved = [
+        np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights if shift.any()
+    ]
+    if (
+        _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1])
+        is not None
+    ):
         look = "its joint limits, which forbid all of them"
-    elif any(_at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None for each in moved):
+    elif any(
+        _at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None
+        for each in moved
+    ):
         place = ", ".join(f"{each:g}" for each in shift)
         look = f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
     wanted = "in which its ball is over the table, in view of the camera and free of contact"
@@ -310,7 +342,10 @@ def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> Fou
     share, box = _find_box(clear, home)
 
     def workspace() -> Workspace:
-        moves = {name: _move(clear, home, *(scale * (np.array(ends) + lift))) for name, ends in MOVES.items()}
+        moves = {
+            name: _move(clear, home, *(scale * (np.array(ends) + lift)))
+            for name, ends in MOVES.items()
+        }
         stretched = _stretch(clear, home, scale * np.array(STRETCHED_POINT), postures)
         shoulder = arm.frames(np.zeros(arm.n))[1, :3, 3]
         return Workspace(scale, centre, shoulder, home, *box, moves, stretched, clear)
@@ -322,7 +357,8 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
     """Return the fit posture with the ball at `point` (3,) m that has the most fit postures around it."""
     q, distance = reach_for(clear.arm, point, postures, clear.lower, clear.upper)
     turned = (q + np.pi) % (2 * np.pi) - np.pi
-    q = np.where((turned >= clear.lower) & (turned <= clear.upper), turned, q)  # within ±π where the stops allow it
+    # Within ±π where the stops allow it
+    q = np.where((turned >= clear.lower) & (turned <= clear.upper), turned, q)
     fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
     if not len(fit):
         return None
@@ -337,7 +373,10 @@ def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, Pair]:
     unit = np.random.default_rng(1).uniform(-1.0, 1.0, (NEIGHBOURS, clear.arm.n))
     best = 0.0, (home - SHRINK[-1] * half, home + SHRINK[-1] * half)
     for shrink in SHRINK:
-        corners = np.maximum(home - shrink * half, clear.lower), np.minimum(home + shrink * half, clear.upper)
+        corners = (
+            np.maximum(home - shrink * half, clear.lower),
+            np.minimum(home + shrink * half, clear.upper),
+        )
         share = float(clear(np.clip(home + shrink * half * unit, *corners)).mean())
         if share >= ENOUGH:
             return shrink * share, corners
@@ -377,7 +416,9 @@ def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> 
     return np.array(ways)
 
 
-def _stretch(clear: Clearance, home: FloatArray, point: FloatArray, postures: FloatArray) -> FloatArray:
+def _stretch(
+    clear: Clearance, home: FloatArray, point: FloatArray, postures: FloatArray
+) -> FloatArray:
     """Return the otherwise fit posture with the least gain, of those that point at a position out of reach."""
     near = home + NEAR * np.random.default_rng(3).standard_normal((NEAR_STARTS, clear.arm.n))
     starts = np.clip(np.vstack([near, postures[: 2 * NEAR_STARTS]]), clear.lower, clear.upper)

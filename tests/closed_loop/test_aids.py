@@ -13,19 +13,32 @@ from servobench.harness.run.resolution import resolve
 EQUIPPED = ("regression_mfac", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
 TURNED = "moderate+camera_rotation=120deg"
 PLUS, PAPER = "regression_mfac", "rbfnn_mfac:published"
-IDENTIFYING = [name for name in METHODS if not name.endswith(":published") and name not in {"constant", "calibrated"}]
+IDENTIFYING = [
+    name
+    for name in METHODS
+    if not name.endswith(":published") and name not in {"constant", "calibrated"}
+]
 
 
 def rows(controller, task, mismatch, seeds, *settings, latency=None):
     """Return the rows of runs with these seeds, which advance side by side."""
     varied = {} if latency is None else {"latency": latency}
     requests = [RunRequest("kinematic", controller, task, mismatch, seed, varied) for seed in seeds]
-    return [run.row for run in carry_out_together([resolve(each, read_settings(None, settings)) for each in requests])]
+    return [
+        run.row
+        for run in carry_out_together(
+            [resolve(each, read_settings(None, settings)) for each in requests]
+        )
+    ]
 
 
 @pytest.mark.parametrize("name", [*EQUIPPED, PAPER])
-def test_with_its_aids_a_method_settles_soon_behind_a_turned_and_late_camera_and_the_published_one_never(name):
-    times = [each["settling_time_s"] for each in rows(name, "random", TURNED, range(2), latency=0.1)]
+def test_with_its_aids_a_method_settles_soon_behind_a_turned_and_late_camera_and_the_published_one_never(
+    name,
+):
+    times = [
+        each["settling_time_s"] for each in rows(name, "random", TURNED, range(2), latency=0.1)
+    ]
     assert np.isnan(times).all() if name == PAPER else max(times) < 5.0
 
 
@@ -37,7 +50,9 @@ def test_wrong_links_and_tool_and_a_camera_turned_right_round_settle():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_camera_that_is_moved_during_the_run_is_noticed_once_and_recovered_from(seed):
     settings = read_settings(None, ["random.duration=10"])
-    run = run_experiment(RunRequest("kinematic", PLUS, "random", "moderate+camera_move=90deg", seed), settings)
+    run = run_experiment(
+        RunRequest("kinematic", PLUS, "random", "moderate+camera_move=90deg", seed), settings
+    )
     assert 5.0 < run.row["settling_time_s"] < 9.0
     assert run.steps["diagnostic_camera_moves"].iloc[-1] == 1.0
 
@@ -51,7 +66,9 @@ def test_it_is_sooner_there_with_less_overshoot_and_tracks_better_than_the_metho
 
 
 @pytest.mark.parametrize("name", some(IDENTIFYING, "regression_mfac", "rls"))
-def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_that_answers_at_once(name):
+def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_that_answers_at_once(
+    name,
+):
     """A law turns the noise of a frame into motion, which at a delay of 0 would explain that this noise is gone."""
     found = rows(name, "circle", "moderate", range(2), "kinematic.command_delay=0", latency=0.05)
     assert max(each["rms_error_evaluated"] for each in found) < 0.003
@@ -59,13 +76,19 @@ def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_tha
 
 @pytest.mark.parametrize("name", some([*IDENTIFYING, "calibrated"], "rbf_pid", "calibrated"))
 def test_a_latency_of_half_a_period_costs_little_more_than_one_of_a_period(name):
-    (half,), (whole,) = (rows(name, "circle", "moderate", [2], latency=latency) for latency in (0.025, 0.05))
+    (half,), (whole,) = (
+        rows(name, "circle", "moderate", [2], latency=latency) for latency in (0.025, 0.05)
+    )
     assert half["rms_error_evaluated"] < 1.6 * whole["rms_error_evaluated"]
 
 
 @pytest.mark.parametrize(
     ("name", "sensing", "seed"),
-    [("regression_mfac", "position", 40448), ("ukf_mfac", "position", 40448), ("regression_mfac", "stereo", 40450)],
+    [
+        ("regression_mfac", "position", 40448),
+        ("ukf_mfac", "position", 40448),
+        ("regression_mfac", "stereo", 40450),
+    ],
 )
 def test_the_posture_moves_the_arm_at_rest_without_spoiling_the_jacobian(name, sensing, seed):
     """The posture moves the feature a little, and the law undoes what is seen of it: no Jacobian explains that."""

@@ -13,15 +13,24 @@ from servobench.harness.config.registry import CONTROLLERS, RENDERED, engine_of
 
 CHANGELOG = Path(__file__).parents[2] / "CHANGELOG.md"
 MARGIN = 10.0  # times the spread that was measured
-ELSEWHERE = some(CONTROLLERS, "rbfnn_mfac:published", "regression_mfac", "ukf_mpc", "nmpc_calibrated")
+ELSEWHERE = some(
+    CONTROLLERS, "rbfnn_mfac:published", "regression_mfac", "ukf_mpc", "nmpc_calibrated"
+)
 RENEW = "if that is meant: make golden, and a line under 'results change' in CHANGELOG.md"
 
 
 def deviations(found, stored):
     """Return how far commands are from the stored ones, in spreads, and settling times, in periods."""
     commands = np.abs(found[golden.SUMS].to_numpy() - stored[golden.SUMS].to_numpy()).max(axis=1)
-    settled = found["settled"].fillna(np.inf).to_numpy(), stored["settled"].fillna(np.inf).to_numpy()
-    late = np.where(settled[0] == settled[1], 0.0, np.abs(np.subtract(*(np.minimum(each, 1e9) for each in settled))))
+    settled = (
+        found["settled"].fillna(np.inf).to_numpy(),
+        stored["settled"].fillna(np.inf).to_numpy(),
+    )
+    late = np.where(
+        settled[0] == settled[1],
+        0.0,
+        np.abs(np.subtract(*(np.minimum(each, 1e9) for each in settled))),
+    )
     return commands / stored["spread"].to_numpy(), late / golden.PERIOD
 
 
@@ -33,15 +42,23 @@ def made(tmp_path_factory):
     return golden.made_apart(tmp_path_factory.mktemp("golden"), names)
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the table is of a kernel of OpenBLAS for x86-64")
+@pytest.mark.skipif(
+    platform.machine() != "x86_64", reason="the table is of a kernel of OpenBLAS for x86-64"
+)
 @pytest.mark.parametrize("plant", plant_parameters(golden.DURATIONS))
-def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(plant, made):
+def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(
+    plant, made
+):
     if plant == "mujoco" and golden.RENDERER not in engine_of(plant):
-        pytest.skip(f"the images of the table are of {golden.RENDERER}, and those here of {engine_of(plant)}")
-    found, stored = (each[each["plant"] == plant].reset_index(drop=True) for each in (made, golden.stored()))
-    stored = stored[stored["controller"].isin(CONTROLLERS if plant == "kinematic" else ELSEWHERE)].reset_index(
-        drop=True
+        pytest.skip(
+            f"the images of the table are of {golden.RENDERER}, and those here of {engine_of(plant)}"
+        )
+    found, stored = (
+        each[each["plant"] == plant].reset_index(drop=True) for each in (made, golden.stored())
     )
+    stored = stored[
+        stored["controller"].isin(CONTROLLERS if plant == "kinematic" else ELSEWHERE)
+    ].reset_index(drop=True)
     assert found["controller"].tolist() == stored["controller"].tolist(), RENEW
     commands, settled = deviations(found, stored)
     changed = found["controller"][(commands > MARGIN) | (settled > 1.0 + 1e-9)].tolist()
@@ -50,8 +67,13 @@ def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_th
 
 def test_a_change_of_a_microradian_a_second_and_a_later_settling_are_seen():
     stored = golden.stored()
-    trained = stored["spread"] > 1e-9  # networks that another processor trains move commands by a microradian a second
-    assert set(stored["controller"][trained]) == {"rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid:published"}
+    # Networks that another processor trains move commands by a microradian a second
+    trained = stored["spread"] > 1e-9
+    assert set(stored["controller"][trained]) == {
+        "rbfnn_mfac",
+        "rbfnn_mfac:published",
+        "rbf_pid:published",
+    }
     commands, _ = deviations(stored.assign(u07=stored["u07"] + 1e-6 + 1e-4 * trained), stored)
     assert (commands > MARGIN).all()
     _, settled = deviations(stored.assign(settled=stored["settled"] + 2 * golden.PERIOD), stored)

@@ -19,7 +19,9 @@ NEAR = 0.1  # [1] of a gain
 
 def analysed(controller, settings):
     """Return the predicted limits and the simulated loop, which has the true Jacobian, and whole periods of latency."""
-    run = resolve(RunRequest("kinematic", controller, "random", "none", 0), Settings({controller: settings}))
+    run = resolve(
+        RunRequest("kinematic", controller, "random", "none", 0), Settings({controller: settings})
+    )
     return analyse_loop(run), SmallLoop(warm_up(run)), run.run.period
 
 
@@ -30,7 +32,8 @@ def test_simulated_limits_are_the_predicted_ones():
 
 
 @pytest.mark.parametrize(
-    ("controller", "settings"), [*((name, {}) for name in PUBLISHED), ("regression_mfac", NO_POSTURE)]
+    ("controller", "settings"),
+    [*((name, {}) for name in PUBLISHED), ("regression_mfac", NO_POSTURE)],
 )
 def test_small_motions_die_out_below_the_predicted_limits_and_not_above_them(controller, settings):
     predicted, loop, period = analysed(controller, settings)

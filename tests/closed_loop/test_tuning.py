@@ -16,7 +16,12 @@ from servobench.controllers.aids import EQUIPPED
 from servobench.harness.batch.plan import TUNING
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import controller_names
-from servobench.harness.config.settings import apply_settings, default_config, flatten, tuned_settings
+from servobench.harness.config.settings import (
+    apply_settings,
+    default_config,
+    flatten,
+    tuned_settings,
+)
 from servobench.harness.run.metrics import log_error, settling_time
 from servobench.harness.studies.tuning.campaign import TOLERANCE, Change, Check, improvements
 from servobench.harness.studies.tuning.objective import (
@@ -46,7 +51,9 @@ from servobench.harness.studies.tuning.spaces import (
 
 CORNERS = 64
 AIDS = {f"aids.{word}" for word in EQUIPPED}
-TUNED = {path.stem: path for path in sorted((Path(controllers.__file__).parent / "tuned").glob("*.toml"))}
+TUNED = {
+    path.stem: path for path in sorted((Path(controllers.__file__).parent / "tuned").glob("*.toml"))
+}
 CHECKED = some(TUNED, "regression_mfac", "rbfnn_mfac", "rls.published", "constant")
 ROUNDING = 0.02  # the curves of ukf_mpc and rbfnn_mfac enlarge it: 0.1.0 differs by so much between two processors
 
@@ -91,13 +98,24 @@ def test_a_number_at_an_edge_is_found_and_its_box_widened_up_to_what_is_no_choic
         "steps": FloatDistribution(2.0, 5.0, step=1.0),
         "word": CategoricalDistribution(("a", "b")),
     }
-    inside = {"gain": 10.0, "share": 0.0, "law.k": 0.1, "steps": 3.0, "word": "a"}  # a lower end of 0 is no choice
+    # A lower end of 0 is no choice
+    inside = {"gain": 10.0, "share": 0.0, "law.k": 0.1, "steps": 3.0, "word": "a"}
     assert edges(space, inside) == {}
     assert dict(widened(space, inside)) == space
     at_ends = {"gain": 1.1, "share": 0.97, "law.k": 0.95, "steps": 5.0}
-    assert edges(space, at_ends) == {"gain": "lower", "share": "upper", "law.k": "upper", "steps": "upper"}
+    assert edges(space, at_ends) == {
+        "gain": "lower",
+        "share": "upper",
+        "law.k": "upper",
+        "steps": "upper",
+    }
     wider = widened(space, at_ends)
-    assert [(wider[key].low, wider[key].high) for key in at_ends] == [(0.25, 100), (0, 2), (0.01, 1.9), (2, 8)]
+    assert [(wider[key].low, wider[key].high) for key in at_ends] == [
+        (0.25, 100),
+        (0, 2),
+        (0.01, 1.9),
+        (2, 8),
+    ]
     assert edges(wider, at_ends) == {}
     beyond = widened(space, {"gain": 150.0})["gain"]
     assert (beyond.low, beyond.high) == (1.0, 600.0)
@@ -109,7 +127,12 @@ def test_values_in_use_lie_inside_of_their_widened_boxes(name):
 
 
 def test_settings_are_nested_and_rounded_to_three_digits():
-    values = {"law.gain": 0.123456, "aids.filter": True, "training.controller.gain": 12345.6, "law.horizon": 9}
+    values = {
+        "law.gain": 0.123456,
+        "aids.filter": True,
+        "training.controller.gain": 12345.6,
+        "law.horizon": 9,
+    }
     assert nested_settings(values) == {
         "law": {"gain": 0.123, "horizon": 9},
         "aids": {"filter": True},
@@ -154,12 +177,23 @@ def test_values_outside_a_space_go_to_its_ends_and_unknown_words_to_the_default(
         "count": IntDistribution(1, 9, step=2),
     }
     default = {"word": "a", "gain": 1.5, "count": 1}
-    assert inside(space, {"word": "c", "gain": 5.0, "count": 6.9}, default) == {"word": "a", "gain": 2.0, "count": 7}
-    assert inside(space, {"word": "b", "gain": 0.5, "count": 3}, default) == {"word": "b", "gain": 1.0, "count": 3}
+    assert inside(space, {"word": "c", "gain": 5.0, "count": 6.9}, default) == {
+        "word": "a",
+        "gain": 2.0,
+        "count": 7,
+    }
+    assert inside(space, {"word": "b", "gain": 0.5, "count": 3}, default) == {
+        "word": "b",
+        "gain": 1.0,
+        "count": 3,
+    }
 
 
 def test_tuned_files_do_not_matter_to_a_trial():
-    trial = Trial("rls:published", apply_settings(find_tunable("rls:published"), {"law": {"integral_gain": 0.5}}))
+    trial = Trial(
+        "rls:published",
+        apply_settings(find_tunable("rls:published"), {"law": {"integral_gain": 0.5}}),
+    )
     assert [run.controller for run in trial.resolved(SMALL.runs()[:1])] == [trial.config]
     assert default_config(find_tunable("rls:published")) != find_tunable("rls:published").config()
 
@@ -167,11 +201,21 @@ def test_tuned_files_do_not_matter_to_a_trial():
 def test_every_run_has_a_robot_of_its_own_and_every_model_and_level_occurs_equally_often():
     chosen = TuningSet(robots=4, offset=100)
     runs, worlds = chosen.runs(), chosen.runs()[::4]
-    assert [run.seed for run in runs] == list(range(TUNING.start + 100, TUNING.start + 100 + len(runs)))
-    models = Counter(next(model for model in reversed(MODELS) if str(run.mismatch).startswith(model)) for run in runs)
+    assert [run.seed for run in runs] == list(
+        range(TUNING.start + 100, TUNING.start + 100 + len(runs))
+    )
+    models = Counter(
+        next(model for model in reversed(MODELS) if str(run.mismatch).startswith(model))
+        for run in runs
+    )
     assert models == dict.fromkeys(MODELS, 4)
-    assert Counter(dict(run.varied)["plant.sensing.latency"] for run in worlds) == dict.fromkeys(LEVELS["latency"], 2)
-    assert Counter(dict(run.varied)["plant.sensing.noise_factor"] for run in worlds) == {1.0: 4, 4.0: 4}
+    assert Counter(dict(run.varied)["plant.sensing.latency"] for run in worlds) == dict.fromkeys(
+        LEVELS["latency"], 2
+    )
+    assert Counter(dict(run.varied)["plant.sensing.noise_factor"] for run in worlds) == {
+        1.0: 4,
+        4.0: 4,
+    }
     assert {dict(run.varied).get("run.period", 0.05) for run in worlds} == {0.2, 0.1, 0.05, 0.008}
     for detector in filter(None, LEVELS["detector"]):
         assert [str(run.mismatch).endswith(detector) for run in worlds].count(True) == 1
@@ -189,7 +233,10 @@ def test_the_worlds_are_drawn_by_the_seed_of_the_set_and_are_others_in_the_secon
 def test_plants_share_robots_and_only_one_whose_drives_can_overshoot_has_overshoot():
     twice = TuningSet(("kinematic", "bullet"), 2).runs()
     here, there = twice[:16], twice[16:]
-    assert ({run.plant for run in here}, {run.plant for run in there}) == ({"kinematic"}, {"bullet"})
+    assert ({run.plant for run in here}, {run.plant for run in there}) == (
+        {"kinematic"},
+        {"bullet"},
+    )
     assert [run.seed for run in here] == [run.seed for run in there]
     keys = [[key for run in runs for key, _ in run.varied] for runs in (here, there)]
     assert [each.count("plant.overshoot") for each in keys] == [2, 0]
@@ -251,7 +298,10 @@ def test_the_cost_of_a_move_is_continuous_where_settling_is_not_and_orders_runs_
 def test_a_better_tuned_controller_has_the_better_score():
     """Resolved-rate control by the true Jacobian: with feedforward it follows the circle, without it lags behind."""
     entry = find_tunable("calibrated")
-    trials = [Trial("calibrated", apply_settings(entry, {"aids": {"feedforward": switch}})) for switch in (True, False)]
+    trials = [
+        Trial("calibrated", apply_settings(entry, {"aids": {"feedforward": switch}}))
+        for switch in (True, False)
+    ]
     runs = [replace(run, mismatch="moderate") for run in SMALL.runs() if run.task == "circle"]
     costs = np.zeros((2, len(runs)))
     for trial, run, cost in evaluate(trials, runs, Workers()):
@@ -260,18 +310,23 @@ def test_a_better_tuned_controller_has_the_better_score():
 
 
 @pytest.mark.parametrize("name", CHECKED)
-def test_committed_values_reach_the_score_that_their_file_states_and_studies_beat_the_defaults(name):
+def test_committed_values_reach_the_score_that_their_file_states_and_studies_beat_the_defaults(
+    name,
+):
     tuned = read_tuned(TUNED[name])
     assert tuned.controller.replace(":", ".") == name
     runs = [tuning_set(tuned).runs()[index] for index in tuning_set(tuned).checked()]
     trial = Trial(tuned.controller, apply_settings(find_tunable(tuned.controller), tuned.settings))
     costs = {run: cost for _, run, cost in evaluate([trial], runs, Workers())}
-    assert score([costs[run] for run in range(len(runs))]) == pytest.approx(tuned.checked_score, abs=ROUNDING)
+    assert score([costs[run] for run in range(len(runs))]) == pytest.approx(
+        tuned.checked_score, abs=ROUNDING
+    )
     if tuned.studies:
         assert tuned.score <= tuned.score_of_defaults
         best = min(tuned.studies, key=lambda study: study.second_score)
         assert tuned.second_score <= best.second_score
-        assert tuned.settings == best.settings or tuned.second_score < best.second_score  # those in use before stay
+        # Those in use before stay
+        assert tuned.settings == best.settings or tuned.second_score < best.second_score
 
 
 def test_committed_values_of_all_methods_have_the_same_budget_on_the_same_runs():
@@ -290,7 +345,10 @@ def test_the_check_of_every_change_finds_the_one_that_helps(made_up, tmp_path):
     }
     found = improvements(judged)
     assert found == sorted(found, key=lambda change: -change.gain)
-    assert all((change in found) == (change.score_after < (1.0 - TOLERANCE) * change.score_before) for change in judged)
+    assert all(
+        (change in found) == (change.score_after < (1.0 - TOLERANCE) * change.score_before)
+        for change in judged
+    )
     scored = len(made_up)
     again = Check(tmp_path, ("rls", "broyden"), SMALL)
     assert list(again.carry_out(Workers())) == []

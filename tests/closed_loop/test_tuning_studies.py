@@ -10,8 +10,21 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, read_tuned
 from servobench import controllers
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods, write_results, write_tuned
-from servobench.harness.studies.tuning.objective import WORST, Ledger, TuningSet, fill, open_ledger, score
+from servobench.harness.studies.tuning.campaign import (
+    TuningPlan,
+    advance,
+    open_methods,
+    write_results,
+    write_tuned,
+)
+from servobench.harness.studies.tuning.objective import (
+    WORST,
+    Ledger,
+    TuningSet,
+    fill,
+    open_ledger,
+    score,
+)
 from servobench.harness.studies.tuning.spaces import (
     ACCEPTED,
     StudyRecord,
@@ -56,7 +69,12 @@ START = {"on": False, "gain": 1.0, "count": 3}
 
 
 def bowl(point):
-    return 1.0 + (np.log(point["gain"] / 3.0)) ** 2 + 0.1 * (point["count"] - 7) ** 2 + (not point["on"])
+    return (
+        1.0
+        + (np.log(point["gain"] / 3.0)) ** 2
+        + 0.1 * (point["count"] - 7) ** 2
+        + (not point["on"])
+    )
 
 
 def test_the_coordinate_search_ends_where_no_change_of_one_value_improves_the_score():
@@ -65,7 +83,10 @@ def test_the_coordinate_search_ends_where_no_change_of_one_value_improves_the_sc
     assert found.evaluations == len(asked) == len({str(point) for point in asked})
     assert found.score == bowl(found.values)
     assert found.values["on"]
-    assert all(bowl(point) >= (1.0 - ACCEPTED) * found.score for _, point in neighbours(SPACE, found.values))
+    assert all(
+        bowl(point) >= (1.0 - ACCEPTED) * found.score
+        for _, point in neighbours(SPACE, found.values)
+    )
 
 
 def test_the_coordinate_search_keeps_to_its_budget_and_keeps_the_best_so_far():
@@ -89,8 +110,12 @@ def test_the_coordinate_search_keeps_to_its_budget_and_keeps_the_best_so_far():
         (IntDistribution(3, 10), 3, [4]),
     ],
 )
-def test_switches_take_their_other_values_and_numbers_a_step_of_a_fifth_within_their_range(distribution, value, tried):
-    assert changes(distribution, value) == (tried if isinstance(value, str) else pytest.approx(tried))
+def test_switches_take_their_other_values_and_numbers_a_step_of_a_fifth_within_their_range(
+    distribution, value, tried
+):
+    assert changes(distribution, value) == (
+        tried if isinstance(value, str) else pytest.approx(tried)
+    )
 
 
 def test_the_defaults_come_first_and_no_two_trials_are_alike(made_up, tmp_path):
@@ -101,7 +126,9 @@ def test_the_defaults_come_first_and_no_two_trials_are_alike(made_up, tmp_path):
     assert method.studies[0].outcome.search_points == 0
 
 
-def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still_better_ones(made_up, tmp_path):
+def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still_better_ones(
+    made_up, tmp_path
+):
     known = len(first_points("broyden"))
     few = outcomes(tmp_path / "few", plan_of("broyden", trials=known))[0][0]
     more = outcomes(tmp_path / "more", plan_of("broyden", trials=known + 10, search=120))[0][0]
@@ -110,7 +137,9 @@ def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still
 
 
 def test_a_campaign_taken_up_again_is_that_which_was_never_interrupted(made_up, tmp_path):
-    whole = outcomes(tmp_path / "whole", plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6))
+    whole = outcomes(
+        tmp_path / "whole", plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6)
+    )
     once = len(made_up)
     part = plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6)
     (tmp_path / "parts").mkdir()
@@ -133,7 +162,9 @@ def test_each_study_has_a_sampler_of_its_own_that_the_seed_decides(made_up, tmp_
     assert repr(second) == repr([method.studies[1].outcome])  # which holds NaN
 
 
-def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_out(made_up, tmp_path):
+def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_out(
+    made_up, tmp_path
+):
     ledger = open_ledger(tmp_path, "rls", SMALL)
     point = {**default_values(find_tunable("rls")), "estimator.forgetting": 7.0}
     assert list(fill([(ledger, "rls", nested_settings(point))], SMALL, Workers())) == ["rls"]
@@ -142,16 +173,22 @@ def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_o
 
 
 @pytest.mark.parametrize(("gain", "runs"), [(2.5, 1), (29.0, 0)])
-def test_a_loop_with_too_small_a_delay_margin_has_the_worst_cost_without_a_run(made_up, tmp_path, gain, runs):
+def test_a_loop_with_too_small_a_delay_margin_has_the_worst_cost_without_a_run(
+    made_up, tmp_path, gain, runs
+):
     ledger = open_ledger(tmp_path, "constant", SMALL)
     point = {**default_values(find_tunable("constant")), "law.proportional_gain": gain}
-    assert list(fill([(ledger, "constant", nested_settings(point))], SMALL, Workers())) == ["constant"]
+    assert list(fill([(ledger, "constant", nested_settings(point))], SMALL, Workers())) == [
+        "constant"
+    ]
     assert len(made_up) == runs
     assert (score(ledger.costs(nested_settings(point))) == pytest.approx(WORST)) == (runs == 0)
 
 
 def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_hold(tmp_path):
-    plan = replace(plan_of("broyden:published", trials=2, studies=2, search=1), runs=TuningSet(robots=1))
+    plan = replace(
+        plan_of("broyden:published", trials=2, studies=2, search=1), runs=TuningSet(robots=1)
+    )
     one, two = carried_out(tmp_path / "one", plan), carried_out(tmp_path / "two", plan, workers=2)
     written, again = write_results(tmp_path / "one", one), write_results(tmp_path / "two", two)
     assert written == again
@@ -159,7 +196,10 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     assert read_tuned(tmp_path / "one" / "broyden.published.toml") == tuned
     assert TuningSet(tuned.plants, tuned.robots, tuned.offset) == plan.runs
     assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (8, 24)
-    assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [(0, 2, 1), (1, 2, 1)]
+    assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [
+        (0, 2, 1),
+        (1, 2, 1),
+    ]
     on_second = [tuned.second_score_of_defaults, *(each.second_score for each in tuned.studies)]
     assert tuned.second_score <= min(on_second), "the values in use stay unless a study is better"
     assert tuned.settings == nested_settings(tuned_point(find_tunable("broyden:published")))
@@ -167,12 +207,18 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     assert tuned.checked_score == pytest.approx(score([costs[index] for index in first]))
 
 
-def test_the_study_that_is_best_on_the_second_set_is_the_one_in_use_of_a_division_too(made_up, tmp_path):
+def test_the_study_that_is_best_on_the_second_set_is_the_one_in_use_of_a_division_too(
+    made_up, tmp_path
+):
     plan = plan_of("rls:published", trials=len(first_points("rls:published")) + 15, studies=3)
     methods = carried_out(tmp_path, plan)
     (tuned,) = write_results(tmp_path, methods).values()
     best = min(tuned.studies, key=lambda each: each.second_score)
-    assert (tuned.settings, tuned.second_score, tuned.score) == (best.settings, best.second_score, best.score)
+    assert (tuned.settings, tuned.second_score, tuned.score) == (
+        best.settings,
+        best.second_score,
+        best.score,
+    )
     assert len({str(each.settings) for each in tuned.studies}) > 1
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "rls.published.jsonl",
@@ -188,7 +234,9 @@ def test_no_result_is_written_before_every_study_has_ended(made_up, tmp_path):
     assert write_results(tmp_path, methods) == {}
 
 
-def test_no_result_is_written_before_every_known_value_has_its_score_on_the_second_set(made_up, tmp_path):
+def test_no_result_is_written_before_every_known_value_has_its_score_on_the_second_set(
+    made_up, tmp_path
+):
     plan = plan_of("rls", trials=len(first_points("rls")) + 2)
     assert write_results(tmp_path, carried_out(tmp_path, plan))
     ledger = tmp_path / "rls.second.jsonl"
@@ -212,7 +260,9 @@ def test_no_result_is_written_before_every_known_value_has_its_score_on_the_seco
 )
 def test_a_ledger_of_other_runs_is_refused_and_no_other_is_begun(made_up, tmp_path, runs, part):
     carried_out(tmp_path, plan_of("rls"))
-    with pytest.raises(ConfigurationError, match=f"rls.jsonl was made with other {part}; name another folder"):
+    with pytest.raises(
+        ConfigurationError, match=f"rls.jsonl was made with other {part}; name another folder"
+    ):
         open_methods(tmp_path, TuningPlan(("broyden", "rls"), 1, runs))
     assert not (tmp_path / "broyden.jsonl").exists()
 
@@ -220,7 +270,9 @@ def test_a_ledger_of_other_runs_is_refused_and_no_other_is_begun(made_up, tmp_pa
 @pytest.mark.parametrize("text", ["hello\nworld\n", "[]\n", '{"a": 1}\n{"b": 2}\n'])
 def test_a_file_that_is_no_ledger_is_refused_and_left_alone(tmp_path, text):
     (tmp_path / "rls.jsonl").write_text(text)
-    with pytest.raises(ConfigurationError, match=r"rls.jsonl (cannot be opened|was made with other)"):
+    with pytest.raises(
+        ConfigurationError, match=r"rls.jsonl (cannot be opened|was made with other)"
+    ):
         Ledger(tmp_path / "rls.jsonl", {"a": 1})
     assert (tmp_path / "rls.jsonl").read_text() == text
 
@@ -235,7 +287,10 @@ def test_a_ledger_forgets_half_a_line_and_goes_on(tmp_path):
     again = Ledger(path, {"a": 1})
     again.add({"law": {"gain": 2.0}}, [0.25])
     last = Ledger(path, {"a": 1})
-    assert (last.costs({"law": {"gain": 1.0}}), last.costs({"law": {"gain": 2.0}})) == ([0.5], [0.25])
+    assert (last.costs({"law": {"gain": 1.0}}), last.costs({"law": {"gain": 2.0}})) == (
+        [0.5],
+        [0.25],
+    )
     assert (last.best(), last.costs({})) == (0.25, None)
 
 

@@ -14,8 +14,15 @@ from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import resolve
 
 NEVER = math.nan
-SEEDS = (704, 711)  # whose settling times networks of four kernels of OpenBLAS give alike to a period or a hundredth
-METHODS = ("regression_mfac", "rbfnn_mfac:published", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published")
+# Whose settling times networks of four kernels of OpenBLAS give alike to a period or a hundredth
+SEEDS = (704, 711)
+METHODS = (
+    "regression_mfac",
+    "rbfnn_mfac:published",
+    "ukf_mfac:published",
+    "ukf_mpc:published",
+    "rbf_pid:published",
+)
 # mismatch, duration [s], and for each of METHODS the settling times of SEEDS [s]
 WORLDS = {
     "severe": (
@@ -42,4 +49,6 @@ def test_methods_settle_as_soon_as_they_did(world, controller):
     results = carry_out_together([resolve(request, settings) for request in requests])
     came = [result.row["settling_time_s"] for result in results]
     one_period = 1.001 * RunSettings().period
-    assert came == pytest.approx(wanted[METHODS.index(controller)], abs=one_period, rel=0.01, nan_ok=True)
+    assert came == pytest.approx(
+        wanted[METHODS.index(controller)], abs=one_period, rel=0.01, nan_ok=True
+    )

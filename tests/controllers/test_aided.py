@@ -51,10 +51,14 @@ def build(aids=EQUIPPED):
 
 
 @pytest.mark.parametrize(("task", "sensing"), [("random", "position"), ("circle", "pixel:hand")])
-def test_a_law_written_as_a_controller_moves_the_arm_as_the_same_law_among_the_parts_does(task, sensing):
+def test_a_law_written_as_a_controller_moves_the_arm_as_the_same_law_among_the_parts_does(
+    task, sensing
+):
     aids = {"aids": dict(EQUIPPED), "law": {"proportional_gain": GAIN, "damping": DAMPING}}
     where = {"task": task, "sensing": sensing, "seed": 3}
-    short = {task: {"duration": 2.5} if task == "random" else {"lap_time": 2.0, "laps": 1, "radius": 0.1}}
+    short = {
+        task: {"duration": 2.5} if task == "random" else {"lap_time": 2.0, "laps": 1, "radius": 0.1}
+    }
     own = servobench.run(Inverse, settings=short, **where)
     part = servobench.run("pid+constant", settings={"pid+constant": aids} | short, **where)
     assert own.row["status"] == "completed"
@@ -78,7 +82,8 @@ def test_the_jacobian_is_the_nominal_one_before_a_run_and_a_better_one_in_its_st
         np.testing.assert_array_equal(given, model)
         driver.run(40)
         found, model, true = own.J, rig.model_jacobian(rig.q), rig.jacobian(rig.q)
-        moved = driver.rig.goal - driver.rig.start  # the direction in which something could be learned
+        # The direction in which something could be learned
+        moved = driver.rig.goal - driver.rig.start
         assert np.linalg.norm((found - true) @ moved) < 0.5 * np.linalg.norm((model - true) @ moved)
         driver.begin()
 
@@ -89,7 +94,9 @@ def test_its_settings_are_the_section_law_and_those_of_the_aids_can_be_set():
     config = Settings({"Inverse": section}).resolve("Inverse", entry.config())
     assert config.law.gain == 3
     assert describe_aids(flatten(config)) == "with all aids but posture"
-    with pytest.raises(ConfigurationError, match=r"Inverse has no setting 'gain': did you mean 'law.gain'"):
+    with pytest.raises(
+        ConfigurationError, match=r"Inverse has no setting 'gain': did you mean 'law.gain'"
+    ):
         Settings({"Inverse": {"gain": 3}}).resolve("Inverse", entry.config())
 
 
@@ -97,8 +104,14 @@ def test_its_settings_are_the_section_law_and_those_of_the_aids_can_be_set():
     ("aids", "line"),
     [
         (True, "own.py: aids must be servobench.EQUIPPED or a mapping like it, got True"),
-        ({"feedfoward": True}, "own.py: Own.aids has no setting 'feedfoward': did you mean 'feedforward'"),
-        ({"limit": "cut"}, "own.py: Own.aids.limit must be one of scale, clip, redistribute, got 'cut'"),
+        (
+            {"feedfoward": True},
+            "own.py: Own.aids has no setting 'feedfoward': did you mean 'feedforward'",
+        ),
+        (
+            {"limit": "cut"},
+            "own.py: Own.aids.limit must be one of scale, clip, redistribute, got 'cut'",
+        ),
     ],
 )
 def test_what_are_no_aids_is_refused_in_one_line(aids, line):
@@ -121,7 +134,10 @@ def test_settings_say_which_aids_a_controller_has(values, words):
 
 
 def test_the_equipment_that_all_share_cannot_be_changed():
-    for change in (lambda: servobench.EQUIPPED.__setitem__("posture", False), lambda: servobench.EQUIPPED.update({})):
+    for change in (
+        lambda: servobench.EQUIPPED.__setitem__("posture", False),
+        lambda: servobench.EQUIPPED.update({}),
+    ):
         with pytest.raises(TypeError, match="servobench.EQUIPPED is shared; change a copy"):
             change()
     assert pickle.loads(pickle.dumps(EQUIPPED)) == copy.deepcopy(EQUIPPED) == {**EQUIPPED}

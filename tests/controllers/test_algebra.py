@@ -45,7 +45,8 @@ def test_the_projection_is_that_of_the_pseudo_inverse_however_close_to_singular(
     J = left * np.array([1.0] * (size - 1) + [smallest]) @ right.T
     kept = project_to_row_space(np.eye(n)[:, :, None], J)[:, :, 0]
     rows = right if smallest > 0.0 else right[:, :-1]
-    rounding = 1e-15 / smallest if smallest > 0.0 else 0.0  # of J itself, which turns its weakest direction
+    # of J itself, which turns its weakest direction
+    rounding = 1e-15 / smallest if smallest > 0.0 else 0.0
     np.testing.assert_allclose(kept, rows @ rows.T, atol=max(1e-9, rounding))
 
 
@@ -54,7 +55,9 @@ def test_the_projection_is_that_of_the_pseudo_inverse_however_close_to_singular(
 def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
     J = 10.0**exponent * np.random.default_rng(seed).normal(size=(3, 6))
     wanted = damped_inverse_by_svd(J, damping)
-    np.testing.assert_allclose(damped_inverse(J, damping), wanted, rtol=1e-7, atol=1e-7 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        damped_inverse(J, damping), wanted, rtol=1e-7, atol=1e-7 * np.abs(wanted).max()
+    )
 
 
 def test_each_lane_is_inverted_by_the_formula_that_is_accurate_for_it():

@@ -28,7 +28,9 @@ def chain(**aids):
     config = METHODS["regression_mfac"].config()
     law = dataclasses.replace(config.law, gain=GAIN, step_weight=WEIGHT)
     aids = AidsConfig(**{**EQUIPPED, "damping": 1e-4, **aids})
-    return METHODS["regression_mfac"].build(dataclasses.replace(config, law=law, aids=aids), KNOWLEDGE)
+    return METHODS["regression_mfac"].build(
+        dataclasses.replace(config, law=law, aids=aids), KNOWLEDGE
+    )
 
 
 def test_the_error_of_what_the_arm_is_bound_for_contracts_as_promised():
@@ -36,7 +38,11 @@ def test_the_error_of_what_the_arm_is_bound_for_contracts_as_promised():
 
     f is the share of the wanted feature step that the limits let through, γ = 1 − exp(−K dt).
     """
-    gamma, arm, target = 1.0 - np.exp(-GAIN * PERIOD), ToyArm(TURN, RESPONSE, latency=2), np.array([0.9, 0.5, 0.2])
+    gamma, arm, target = (
+        1.0 - np.exp(-GAIN * PERIOD),
+        ToyArm(TURN, RESPONSE, latency=2),
+        np.array([0.9, 0.5, 0.2]),
+    )
     servo, checked, limited, observation = chain(posture=False, filter=False), 0, 0, arm.observe()
     servo.reset(observation, 0)
     for k in range(60):
@@ -87,10 +93,19 @@ def test_the_command_that_is_sent_keeps_the_acceleration_limit_of_the_law(aids):
         METHODS["ukf_mpc"].config(),
         dataclasses.replace(KNOWLEDGE, region=(np.zeros(N), np.full(N, 2.0))),
     )
-    law = dataclasses.replace(config.law, joint_acceleration_limit=2.0, use_preview="feedforward" not in aids)
+    law = dataclasses.replace(
+        config.law, joint_acceleration_limit=2.0, use_preview="feedforward" not in aids
+    )
     config = dataclasses.replace(config, law=law, aids=dataclasses.replace(config.aids, **aids))
-    arm, servo, sent = ToyArm(np.eye(M), RESPONSE), METHODS["ukf_mpc"].build(config, knowledge), [np.zeros(N)]
-    observation, reference = arm.observe(), 0.1 * np.outer(np.arange(1.0 + PREVIEW), [1.0, 0.5, 0.0])
+    arm, servo, sent = (
+        ToyArm(np.eye(M), RESPONSE),
+        METHODS["ukf_mpc"].build(config, knowledge),
+        [np.zeros(N)],
+    )
+    observation, reference = (
+        arm.observe(),
+        0.1 * np.outer(np.arange(1.0 + PREVIEW), [1.0, 0.5, 0.0]),
+    )
     servo.reset(observation, 0)
     for _ in range(30):
         sent.append(servo.step(observation, reference).joint_velocity)
@@ -135,7 +150,9 @@ AIDS = [
 
 def others():
     """Yield a chain and its settings for every estimator; laws and aids take turns."""
-    for (law, ofl, own), (estimator, ofe), aids in zip(cycle(OF_LAWS), OF_ESTIMATORS, cycle(AIDS), strict=False):
+    for (law, ofl, own), (estimator, ofe), aids in zip(
+        cycle(OF_LAWS), OF_ESTIMATORS, cycle(AIDS), strict=False
+    ):
         entry = compose(law, estimator)
         config = entry.config()
         parts = {
@@ -143,7 +160,9 @@ def others():
             "estimator": dataclasses.replace(config.estimator, **ofe),
         }
         initial = InitialConfig("probe", probe_step=0.01, settle_time=0.05, average_time=0.05)
-        config = dataclasses.replace(config, **parts, aids=AidsConfig(**(aids | own)), initial=initial)
+        config = dataclasses.replace(
+            config, **parts, aids=AidsConfig(**(aids | own)), initial=initial
+        )
         yield pytest.param(entry, config, id=f"{law}+{estimator}")
 
 
@@ -163,14 +182,19 @@ def lane_loop(servo, lanes):
     """
     rng = np.random.default_rng(3)
     turned = np.stack([A, -A + 0.05 * rng.normal(size=A.shape), A[[1, 2, 0]]])
-    noise, valid = 0.001 * rng.normal(size=(PERIODS, LANES, M)), rng.random((PERIODS, LANES, 1)) < 0.85
+    noise, valid = (
+        0.001 * rng.normal(size=(PERIODS, LANES, M)),
+        rng.random((PERIODS, LANES, 1)) < 0.85,
+    )
     valid = np.repeat(valid, M, axis=-1)
     valid[0], valid[15:33, 1], valid[36:40, 2, 1] = True, False, False
     goal = 0.2 * rng.normal(size=(LANES, M))
     goal[2] = 0.0
     phase = 0.1 * np.maximum(np.arange(PERIODS + PREVIEW + 1) - 15.0, 0.0)[:, None, None]
     reference = goal + 0.1 * np.sin(phase + np.arange(M)) - 0.1 * np.sin(np.arange(M))
-    moved = np.where((np.arange(PERIODS)[:, None, None] > 30) & (np.arange(LANES)[:, None] == 0), 0.5, 0.0)
+    moved = np.where(
+        (np.arange(PERIODS)[:, None, None] > 30) & (np.arange(LANES)[:, None] == 0), 0.5, 0.0
+    )
     delay, q = np.array([0, 3, 1])[lanes], np.zeros((*np.shape(lanes), N))
     past, feature, found, state = [q] * 4, np.zeros((*np.shape(lanes), M)), [], None
     for k in range(PERIODS):
@@ -178,7 +202,9 @@ def lane_loop(servo, lanes):
         exposed = np.take_along_axis(late, np.asarray(delay)[None, ..., None], axis=0)[0]
         now = np.matvec(turned[lanes], exposed) + noise[k, lanes] + moved[k, lanes]
         feature = np.where(valid[k, lanes], now, feature)
-        look = trusted_observation(k * PERIOD, q, feature, valid[k, lanes].all(axis=-1), valid[k, lanes])
+        look = trusted_observation(
+            k * PERIOD, q, feature, valid[k, lanes].all(axis=-1), valid[k, lanes]
+        )
         state = servo.start(look) if state is None else state
         ahead = np.ascontiguousarray(np.moveaxis(reference[k : k + PREVIEW + 1, lanes], 0, -2))
         state, u = servo.step(state, look, ahead)
@@ -193,7 +219,8 @@ def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(entry, con
     found, _ = assert_lanes(partial(lane_loop, entry.build(config, KNOWING).servo))
     assert np.isfinite([each["u"] for each in found]).all()
     limited = np.sum([each["saturated"] for each in found], axis=-1)
-    assert {1, 2} & set(limited.tolist()) or "solver_success" in found[-1]  # in one period in some lanes only
+    # In one period in some lanes only
+    assert {1, 2} & set(limited.tolist()) or "solver_success" in found[-1]
     assert found[-1].get("camera_moves", [1])[0] >= 1
 
 

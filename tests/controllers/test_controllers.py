@@ -24,10 +24,15 @@ from servobench.harness.check.report import report
 from servobench.harness.config.settings import default_config
 from servobench.plant.contract.signals import Observation
 
-PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [compose(law, "kalman") for law in LAWS]
-COMPOSED = [pytest.param(entry, id=entry.name) for entry in dict.fromkeys([*METHODS.values(), *PAIRS])]
+PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [
+    compose(law, "kalman") for law in LAWS
+]
+COMPOSED = [
+    pytest.param(entry, id=entry.name) for entry in dict.fromkeys([*METHODS.values(), *PAIRS])
+]
 EQUIPPED = [entry for name, entry in METHODS.items() if not name.endswith(PUBLISHED)]
-NOT_CHECKED = [each for each in COMPOSED if each.values[0] not in EQUIPPED]  # by the checks that users call
+# By the checks that users call
+NOT_CHECKED = [each for each in COMPOSED if each.values[0] not in EQUIPPED]
 ALL = [*COMPOSED, pytest.param(nmpc_calibrated.ENTRY, id="nmpc_calibrated")]
 PREVIEW = 20
 SMALL = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
@@ -43,8 +48,15 @@ def robot(n, m, seed):
         return A * (B * np.cos(B * q))[..., None, :]
 
     def train_small(config):
-        jacobian, controller = JacobianTraining(centres=6, **SMALL), ControllerTraining(hidden=6, **SMALL)
-        return train(dataclasses.replace(config, jacobian=jacobian, controller=controller), nominal_jacobian, spec)
+        jacobian, controller = (
+            JacobianTraining(centres=6, **SMALL),
+            ControllerTraining(hidden=6, **SMALL),
+        )
+        return train(
+            dataclasses.replace(config, jacobian=jacobian, controller=controller),
+            nominal_jacobian,
+            spec,
+        )
 
     return RobotKnowledge(
         spec,
@@ -61,7 +73,10 @@ def random_run(controller, spec, seed, scale, steps=12, start=True):
     """Feed random finite observations and return commands, Jacobians and diagnostics."""
     rng, found = np.random.default_rng(seed), []
     for k in range(steps):
-        q, feature = rng.uniform(spec.joint_lower, spec.joint_upper), rng.normal(scale=scale, size=spec.m)
+        q, feature = (
+            rng.uniform(spec.joint_lower, spec.joint_upper),
+            rng.normal(scale=scale, size=spec.m),
+        )
         observation = Observation(k * spec.period, q, feature, bool(rng.random() < 0.8))
         if k == 0 and start:
             controller.reset(observation, 0)
@@ -73,7 +88,12 @@ def random_run(controller, spec, seed, scale, steps=12, start=True):
 
 @pytest.mark.parametrize("entry", ALL)
 @settings(max_examples=8, derandomize=True)
-@given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-3, 6))
+@given(
+    n=st.integers(2, 8),
+    m=st.integers(1, 4),
+    seed=st.integers(0, 10**6),
+    exponent=st.integers(-3, 6),
+)
 @pytest.mark.slow
 def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n, m, seed, exponent):
     knowledge = robot(n, m, seed)
@@ -87,8 +107,11 @@ def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n,
 
 @pytest.mark.parametrize("entry", [*EQUIPPED, nmpc_calibrated.ENTRY], ids=lambda entry: entry.name)
 def test_a_method_keeps_the_contract_of_controllers(entry):
-    checked = report(entry.name, ControllerChecks(entry).checks(), lambda _name: None, lambda _finding: None)
-    assert {each.check for each in checked.failures} <= {"time"}, checked.failures  # which the machine decides
+    checked = report(
+        entry.name, ControllerChecks(entry).checks(), lambda _name: None, lambda _finding: None
+    )
+    # Which the machine decides
+    assert {each.check for each in checked.failures} <= {"time"}, checked.failures
     assert len(checked.findings) == 18
 
 
@@ -111,18 +134,27 @@ def test_a_restored_controller_goes_on_as_the_saved_one_did(entry):
     expected = random_run(controller, knowledge.spec, 2, 0.5, start=False)
     for _ in range(2):  # restoring does not use the saved state up
         controller.restore(saved)
-        np.testing.assert_equal(random_run(controller, knowledge.spec, 2, 0.5, start=False), expected)
+        np.testing.assert_equal(
+            random_run(controller, knowledge.spec, 2, 0.5, start=False), expected
+        )
 
 
 @pytest.mark.parametrize("entry", COMPOSED)
 def test_estimator_law_and_servo_report_different_things(entry):
     knowledge = robot(4, 2, 3)
-    controller, names = entry.build(default_config(entry), knowledge), ["probing", "jacobian_prediction_error"]
+    controller, names = (
+        entry.build(default_config(entry), knowledge),
+        ["probing", "jacobian_prediction_error"],
+    )
     (_, _, merged), *_ = random_run(controller, knowledge.spec, 3, 0.5)
     assert isinstance(controller, ServoController)
     servo, state = controller.servo, controller.state
     estimation, learned = servo.estimation, state.estimation.learned
-    names += [*estimation.estimator.diagnostics(learned.estimator), *servo.law.diagnostics(state.law), "saturated"]
+    names += [
+        *estimation.estimator.diagnostics(learned.estimator),
+        *servo.law.diagnostics(state.law),
+        "saturated",
+    ]
     if estimation.pairing is not None:
         names += estimation.pairing.diagnostics(learned.pair)
     if servo.predictor is not None:
@@ -133,12 +165,23 @@ def test_estimator_law_and_servo_report_different_things(entry):
 @pytest.mark.parametrize("entry", ALL)
 def test_what_is_of_the_wrong_size_or_not_finite_is_refused(entry):
     controller = entry.build(default_config(entry), robot(3, 2, 0))
-    good, narrow, tall, still = *(seen([0] * n, [0] * m) for n, m in ((3, 2), (2, 2), (3, 3))), np.zeros((21, 2))
+    good, narrow, tall, still = (
+        *(seen([0] * n, [0] * m) for n, m in ((3, 2), (2, 2), (3, 3))),
+        np.zeros((21, 2)),
+    )
     controller.reset(good, 0)
     for refused, arguments, message in (
-        (controller.step, (narrow, still), r"observation.joint_position must have shape \(3,\), got \(2,\)"),
+        (
+            controller.step,
+            (narrow, still),
+            r"observation.joint_position must have shape \(3,\), got \(2,\)",
+        ),
         (controller.reset, (tall, 0), r"observation.feature must have shape \(2,\), got \(3,\)"),
-        (controller.step, (good, still[:4]), r"reference must have shape \(21, 2\) for a preview of 20, got \(4, 2\)"),
+        (
+            controller.step,
+            (good, still[:4]),
+            r"reference must have shape \(21, 2\) for a preview of 20, got \(4, 2\)",
+        ),
         (controller.step, (good, np.nan * still), "reference must be finite"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -105,7 +105,10 @@ def test_every_update_equals_the_published_formulas(name):
     config = kind(initial_deviation=0.3, walk=WALK, feature_noise=NOISE)
     J = np.random.default_rng(1).normal(scale=0.4, size=(M, N))
     run, x, P = Learning(make(config), J), J.ravel(), 0.09 * np.eye(M * N)
-    assert run.diagnostics() == {"estimator_updated": False, "jacobian_deviation": pytest.approx(0.3)}
+    assert run.diagnostics() == {
+        "estimator_updated": False,
+        "jacobian_deviation": pytest.approx(0.3),
+    }
     for dq, dy in motions(40):
         run.update(motion(dq, dy))
         H, R = np.kron(np.eye(M), dq), 2 * NOISE**2 * np.eye(M)
@@ -113,7 +116,10 @@ def test_every_update_equals_the_published_formulas(name):
         np.testing.assert_allclose(run.jacobian().ravel(), x, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(block_diag(*run.state.P), P, rtol=1e-12, atol=1e-12)
     deviation = np.sqrt(np.trace(P) / (M * N))
-    assert run.diagnostics() == {"estimator_updated": True, "jacobian_deviation": pytest.approx(deviation)}
+    assert run.diagnostics() == {
+        "estimator_updated": True,
+        "jacobian_deviation": pytest.approx(deviation),
+    }
 
 
 @pytest.mark.parametrize("name", FILTERS)

@@ -5,7 +5,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kit.toy import KNOWLEDGE, NETWORK, PERIOD, TURN, M, N, Recorded, Recorder, late_features, path, plant_spec
+from kit.toy import (
+    KNOWLEDGE,
+    NETWORK,
+    PERIOD,
+    TURN,
+    M,
+    N,
+    Recorded,
+    Recorder,
+    late_features,
+    path,
+    plant_spec,
+)
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.estimators.projection import BroydenConfig, ProjectionEstimator
@@ -50,7 +62,9 @@ def test_the_deviation_from_a_model_by_hand(model):
     stages, state = two_steps(model)
     B = curved([0.1, 0.2])  # which the regression first changes after this motion
     if model == "regression":
-        B = stages.pairing.regression.jacobian(state.learned.pair.regression, np.array([0.1, 0.2]), B)
+        B = stages.pairing.regression.jacobian(
+            state.learned.pair.regression, np.array([0.1, 0.2]), B
+        )
         assert B[0, 0] > 1.2
     np.testing.assert_allclose(state.learned.estimator.J, E)
     np.testing.assert_allclose(state.jacobian, B + E)
@@ -93,7 +107,9 @@ def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_f
     states, _ = follow(recorder, q, y, filter=True, feature_noise=0.01)
     e = np.array([state.learned.pair.regression.mean[:, -1] for state in states])
     assert np.abs(e[1:]).min(axis=1).all()
-    np.testing.assert_allclose([each.feature_step for each in recorder.motions], np.diff(y - e, axis=0), atol=1e-12)
+    np.testing.assert_allclose(
+        [each.feature_step for each in recorder.motions], np.diff(y - e, axis=0), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("model", ["own", "regression"])
@@ -124,7 +140,9 @@ def follow(estimator, q, y, knowledge=MODELLED, **aids):
     stages = Estimation(estimator, knowledge, AidsConfig(**aids), NONE)
     state, states = stages.start(Observation(0.0, q[0], y[0]), knowledge.nominal_jacobian(q[0])), []
     for k in range(len(q)):
-        state = stages.update(state, Observation(k * knowledge.spec.period, q[k], y[k]), np.zeros(M))
+        state = stages.update(
+            state, Observation(k * knowledge.spec.period, q[k], y[k]), np.zeros(M)
+        )
         states.append(state)
     return states, stages
 
@@ -133,36 +151,56 @@ def follow(estimator, q, y, knowledge=MODELLED, **aids):
 @pytest.mark.parametrize("delay", ["given", "identified"])
 def test_beside_an_exact_model_the_deviation_learns_nothing(model, delay):
     q = path(3)
-    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, late_features(q, np.eye(M)), model=model, delay=delay)
+    states, _ = follow(
+        ProjectionEstimator(BroydenConfig()),
+        q,
+        late_features(q, np.eye(M)),
+        model=model,
+        delay=delay,
+    )
     for k, state in enumerate(states):
         np.testing.assert_allclose(state.learned.estimator.J, 0.0, atol=1e-12)
         np.testing.assert_allclose(state.jacobian, NETWORK.jacobian(q[k]), atol=1e-12)
-    own, _ = follow(ProjectionEstimator(BroydenConfig()), q, late_features(q, np.eye(M)), delay=delay)
+    own, _ = follow(
+        ProjectionEstimator(BroydenConfig()), q, late_features(q, np.eye(M)), delay=delay
+    )
     assert np.linalg.norm(own[-1].jacobian - NETWORK.jacobian(q[-1])) > 0.05
 
 
 @pytest.mark.parametrize("aids", [{}, {"delay": "given"}], ids=["as read", "paired"])
-@pytest.mark.parametrize(("period", "count"), [(0.1, 1), (0.05, 1), (0.02, 2), (0.008, 6), (0.004, 12)])
+@pytest.mark.parametrize(
+    ("period", "count"), [(0.1, 1), (0.05, 1), (0.02, 2), (0.008, 6), (0.004, 12)]
+)
 def test_as_much_is_learned_in_a_second_at_every_rate(period, count, aids):
-    knowledge = dataclasses.replace(MODELLED, spec=dataclasses.replace(KNOWLEDGE.spec, period=period))
+    knowledge = dataclasses.replace(
+        MODELLED, spec=dataclasses.replace(KNOWLEDGE.spec, period=period)
+    )
     t = period * np.arange(round(2.0 / period))
     q, recorder = np.outer(t, np.arange(1.0, N + 1.0)), Recorder()
     follow(recorder, q, 0.1 * q[:, :M], knowledge, **aids)
     assert len(recorder.motions) == (len(t) - 1) // count
     for motion in recorder.motions:
         assert motion.duration == pytest.approx(count * period)
-        np.testing.assert_allclose(motion.joint_step, count * period * np.arange(1.0, N + 1.0), rtol=1e-9)
+        np.testing.assert_allclose(
+            motion.joint_step, count * period * np.arange(1.0, N + 1.0), rtol=1e-9
+        )
 
 
 def test_a_motion_is_paired_with_that_of_the_joints_when_its_frames_were_exposed():
     q, recorder = path(1.5), Recorder()
-    stages = Estimation(recorder, MODELLED, AidsConfig(delay="given", noise="identified"), Delays(0.15, 0.0, 0.0))
+    stages = Estimation(
+        recorder, MODELLED, AidsConfig(delay="given", noise="identified"), Delays(0.15, 0.0, 0.0)
+    )
     state = stages.start(Observation(0.0, q[0], np.zeros(M)), NETWORK.jacobian(q[0]))
     for k in range(30):
-        state = stages.update(state, Observation(k * PERIOD, q[k], 0.01 * k * np.ones(M)), np.full(M, 1.0))
+        state = stages.update(
+            state, Observation(k * PERIOD, q[k], 0.01 * k * np.ones(M)), np.full(M, 1.0)
+        )
     for k, motion in enumerate(recorder.motions, start=1):
         np.testing.assert_array_equal(motion.joint_position, q[max(k - 4, 0)])
-        np.testing.assert_allclose(motion.joint_step, q[max(k - 3, 0)] - q[max(k - 4, 0)], atol=1e-15)
+        np.testing.assert_allclose(
+            motion.joint_step, q[max(k - 3, 0)] - q[max(k - 4, 0)], atol=1e-15
+        )
         np.testing.assert_allclose(motion.error, 1.0 - 0.01 * k)
         assert motion.noise > 0.0
     assert len(recorder.motions) == 29
@@ -172,7 +210,9 @@ def test_without_a_nominal_model_the_first_jacobian_stands_for_it():
     q = path(2)
     J = NETWORK.jacobian(q[0])
     unknown = dataclasses.replace(MODELLED, nominal_jacobian=None)
-    stages = Estimation(ProjectionEstimator(BroydenConfig()), unknown, AidsConfig(model="regression"), NONE)
+    stages = Estimation(
+        ProjectionEstimator(BroydenConfig()), unknown, AidsConfig(model="regression"), NONE
+    )
     state, y = stages.start(Observation(0.0, q[0], np.zeros(M)), J), np.matvec(TURN @ J, q)
     for k in range(40):
         state = stages.update(state, Observation(k * PERIOD, q[k], y[k]), np.zeros(M))

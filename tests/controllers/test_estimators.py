@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kit.toy import KNOWLEDGE, PERIOD, Learning, M, N, jacobian_network, motion, only_jacobian, plant_spec
+from kit.toy import (
+    KNOWLEDGE,
+    PERIOD,
+    Learning,
+    M,
+    N,
+    jacobian_network,
+    motion,
+    only_jacobian,
+    plant_spec,
+)
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.estimator import Motion
@@ -54,7 +64,12 @@ def random_motions(n, m, count, seed=3):
     ("estimator", "jacobian", "dq", "expected"),
     [
         # Δy − JΔq = 0.4 − 0.2 = 0.2, gain = 0.5 · (1, 1) / 2, and with μ = 2 it is 0.5 · (1, 1) / (2 + 2)
-        (ProjectionEstimator(BroydenConfig(step_factor=0.5)), [[0.1, 0.1]], [1.0, 1.0], [[0.15, 0.15]]),
+        (
+            ProjectionEstimator(BroydenConfig(step_factor=0.5)),
+            [[0.1, 0.1]],
+            [1.0, 1.0],
+            [[0.15, 0.15]],
+        ),
         (
             ProjectionEstimator(CfdlConfig(step_factor=0.5, regularisation=2.0)),
             [[0.1, 0.1]],
@@ -62,9 +77,24 @@ def random_motions(n, m, count, seed=3):
             [[0.125, 0.125]],
         ),
         # P = 1/4, r = 2 · 1/8 = 1/4, Δq = (1, 0): S = 1/2, K = (1/2, 0), innovation 0.4 − 0.2 = 0.2
-        (kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
-        (kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
-        (ukf_estimator(UkfConfig(0.5, 0.0, np.sqrt(0.125), form="sigma_points")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
+        (
+            kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")),
+            [[0.2, 0.3]],
+            [1, 0],
+            [[0.3, 0.3]],
+        ),
+        (
+            kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")),
+            [[0.2, 0.3]],
+            [1, 0],
+            [[0.3, 0.3]],
+        ),
+        (
+            ukf_estimator(UkfConfig(0.5, 0.0, np.sqrt(0.125), form="sigma_points")),
+            [[0.2, 0.3]],
+            [1, 0],
+            [[0.3, 0.3]],
+        ),
     ],
 )
 def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq, expected):
@@ -77,12 +107,20 @@ def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq,
 
 def test_the_first_step_of_least_squares_equals_the_one_computed_by_hand():
     # PΔq = (2, 2), K = (2, 2) / (0.5 + 4), misfit 0.2; P = (2I − (2, 2)(2, 2)ᵀ / 4.5) / 0.5
-    J, P = rls_update(np.array([[0.1, 0.1]]), 2.0 * np.eye(2), np.ones(2), np.array([0.4]), forgetting=np.asarray(0.5))
+    J, P = rls_update(
+        np.array([[0.1, 0.1]]),
+        2.0 * np.eye(2),
+        np.ones(2),
+        np.array([0.4]),
+        forgetting=np.asarray(0.5),
+    )
     np.testing.assert_allclose(J, [[0.1 + 0.4 / 4.5] * 2], atol=1e-15)
     np.testing.assert_allclose(P, 2.0 * (2.0 * np.eye(2) - 4.0 / 4.5), atol=1e-14)
 
 
-@pytest.mark.parametrize(("alpha", "beta", "kappa"), [(1.0, 2.0, 0.0), (1.0, 0.0, 2.0), (0.1, 2.0, 0.0)])
+@pytest.mark.parametrize(
+    ("alpha", "beta", "kappa"), [(1.0, 2.0, 0.0), (1.0, 0.0, 2.0), (0.1, 2.0, 0.0)]
+)
 def test_the_unscented_filter_equals_the_kalman_filter_over_1000_random_steps(alpha, beta, kappa):
     n, m = 6, 3
     rng = np.random.default_rng(5)
@@ -112,7 +150,9 @@ def test_the_split_forms_equal_the_full_ones(n, m):
             run.update(motion(dq, dy))
     for run in runs[1:]:
         np.testing.assert_allclose(run.jacobian(), runs[0].jacobian(), atol=1e-10)
-        np.testing.assert_allclose(covariance_of(run.state), covariance_of(runs[0].state), atol=1e-12)
+        np.testing.assert_allclose(
+            covariance_of(run.state), covariance_of(runs[0].state), atol=1e-12
+        )
         assert run.diagnostics() == pytest.approx(runs[0].diagnostics())
 
 
@@ -139,15 +179,23 @@ def test_least_squares_forgets_by_the_time_of_a_motion():
     begun = estimator.start(np.zeros((1, 2)))
     for duration in (0.1, 0.5):
         J, _ = rls_update(begun.J, begun.P, dq, dy, forgetting=np.exp(np.array(-duration / 2.0)))
-        np.testing.assert_array_equal(estimator.update(begun, motion(dq, dy, duration=duration)).J, J)
+        np.testing.assert_array_equal(
+            estimator.update(begun, motion(dq, dy, duration=duration)).J, J
+        )
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4))
 def test_the_compact_form_without_regularisation_is_broydens_update(seed, n, m):
     rng = np.random.default_rng(seed)
-    J, dq, dy = rng.normal(size=(m, n)), rng.normal(scale=0.1, size=n), rng.normal(scale=0.1, size=m)
+    J, dq, dy = (
+        rng.normal(size=(m, n)),
+        rng.normal(scale=0.1, size=n),
+        rng.normal(scale=0.1, size=m),
+    )
     broyden = ProjectionEstimator(BroydenConfig(step_factor=1.0, min_joint_step=1e-9))
-    compact = ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-300, min_joint_step=0.0, reset=False))
+    compact = ProjectionEstimator(
+        CfdlConfig(step_factor=1.0, regularisation=1e-300, min_joint_step=0.0, reset=False)
+    )
     found, expected = (each.update(each.start(J), motion(dq, dy)).J for each in (compact, broyden))
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(expected @ dq, dy, atol=1e-11)
@@ -220,7 +268,9 @@ def test_an_estimator_that_lacks_what_it_needs_is_refused():
         ({"reset": False}, -0.5, -0.5),
     ],
 )
-def test_the_compact_form_returns_to_its_start_when_it_vanishes_or_its_sign_is_lost(settings, size, expected):
+def test_the_compact_form_returns_to_its_start_when_it_vanishes_or_its_sign_is_lost(
+    settings, size, expected
+):
     estimator = ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, **settings))
     run = Learning(estimator, np.array([[0.5]]))
     run.update(motion([0.1], [0.1 * size]))
@@ -240,10 +290,14 @@ SETTINGS = [
 
 def made(name, changes):
     part = ESTIMATORS[name]
-    return part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+    return part.make(
+        part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else [])
+    )
 
 
-@pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
+@pytest.mark.parametrize(
+    ("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else ""
+)
 def test_at_the_start_each_lane_tells_its_own_numbers(name, changes):
     estimator = made(name, changes)
     for lead in ((), (3,), (2, 3)):
@@ -258,7 +312,9 @@ def test_a_motion_of_the_least_length_counts_and_a_smaller_one_does_not(name):
     estimator = made(name, {"min_joint_step": 0.25})
     for length, counts in ((0.25, True), (0.2499, False)):
         state = estimator.start(np.ones((M, N)))
-        way = Motion(np.zeros(N), length * np.eye(N)[1], np.full(M, 0.1), np.zeros(M), np.asarray(PERIOD)[()])
+        way = Motion(
+            np.zeros(N), length * np.eye(N)[1], np.full(M, 0.1), np.zeros(M), np.asarray(PERIOD)[()]
+        )
         after = estimator.update(state, way)
         assert bool(estimator.diagnostics(after)["estimator_updated"]) == counts
         assert counts != (after.J == state.J).all()
@@ -267,7 +323,9 @@ def test_a_motion_of_the_least_length_counts_and_a_smaller_one_does_not(name):
 FILTERS = [each for each in SETTINGS if hasattr(made(*each).start(np.ones((M, N))), "P")]
 
 
-@pytest.mark.parametrize(("name", "changes"), FILTERS, ids=lambda part: part if isinstance(part, str) else "")
+@pytest.mark.parametrize(
+    ("name", "changes"), FILTERS, ids=lambda part: part if isinstance(part, str) else ""
+)
 @pytest.mark.parametrize("factor", [-1.0, np.nan])
 def test_a_covariance_that_is_not_positive_definite_is_a_named_fault(name, changes, factor):
     estimator = made(name, changes)
@@ -278,4 +336,8 @@ def test_a_covariance_that_is_not_positive_definite_is_a_named_fault(name, chang
 
 
 def test_estimators_say_which_of_them_bring_a_model():
-    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {"true", "rbf", "rbf_lyapunov"}
+    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {
+        "true",
+        "rbf",
+        "rbf_lyapunov",
+    }

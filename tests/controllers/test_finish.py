@@ -17,7 +17,9 @@ NOTHING = np.zeros(())
 def finish(wanted, q=None, forward=NOTHING, J=A, knowledge=KNOWLEDGE, **aids):
     """Return what leaves the chain, and whether it was limited."""
     made = Finish(AidsConfig(**aids), knowledge, "ALaw", ())
-    return made.finish(np.asarray(wanted), J, np.zeros(np.shape(wanted)) if q is None else q, forward)
+    return made.finish(
+        np.asarray(wanted), J, np.zeros(np.shape(wanted)) if q is None else q, forward
+    )
 
 
 def test_feedforward_and_posture_by_hand():
@@ -40,14 +42,19 @@ def test_the_posture_does_not_move_the_feature_and_comes_nearer_to_the_middle():
         u, _ = finish(np.zeros(N), q, posture=True, posture_gain=0.2, damping=1e-9)
         q = q + u * PERIOD
         np.testing.assert_allclose(A @ q, y, atol=1e-7)
-    np.testing.assert_allclose(null @ q, np.exp(-0.2 * 200 * PERIOD) * null @ np.linspace(-1.0, 1.0, N), atol=1e-6)
+    np.testing.assert_allclose(
+        null @ q, np.exp(-0.2 * 200 * PERIOD) * null @ np.linspace(-1.0, 1.0, N), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("period", [0.1, 0.008])
 def test_the_posture_does_not_depend_on_the_control_rate(period):
     ends = []
     for dt in (PERIOD, period):
-        knowledge, q = dataclasses.replace(KNOWLEDGE, spec=dataclasses.replace(KNOWLEDGE.spec, period=dt)), np.ones(N)
+        knowledge, q = (
+            dataclasses.replace(KNOWLEDGE, spec=dataclasses.replace(KNOWLEDGE.spec, period=dt)),
+            np.ones(N),
+        )
         for _ in range(round(2.0 / dt)):
             q = q + finish(np.zeros(N), q, posture=True, knowledge=knowledge, damping=1e-9)[0] * dt
         ends.append(q)
@@ -64,7 +71,9 @@ def test_a_command_within_the_limits_is_sent_as_it_is(limit):
 
 def test_a_command_beyond_the_limits_is_scaled_cut_or_taken_over_by_joints_with_room():
     wanted = np.array([1.9, -0.5, 0.2, -1.5, 0.6]) * LIMIT
-    scaled, cut, shared = (finish(wanted, limit=limit) for limit in ("scale", "clip", "redistribute"))
+    scaled, cut, shared = (
+        finish(wanted, limit=limit) for limit in ("scale", "clip", "redistribute")
+    )
     np.testing.assert_allclose(scaled[0], wanted / 1.9)
     np.testing.assert_array_equal(cut[0], np.clip(wanted, -LIMIT, LIMIT))
     way = A @ wanted
@@ -83,7 +92,8 @@ def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
 
 
 @pytest.mark.parametrize(
-    ("excess", "room", "taken"), [(5e-6, 1.0, 5e-6), (5e-7, 1.0, 0.0), (0.5, 3e-9, 3e-9), (0.5, 3e-10, 0.0)]
+    ("excess", "room", "taken"),
+    [(5e-6, 1.0, 5e-6), (5e-7, 1.0, 0.0), (0.5, 3e-9, 3e-9), (0.5, 3e-10, 0.0)],
 )
 def test_only_a_remainder_and_a_room_above_rounding_are_taken_over(excess, room, taken):
     room, wanted, one = np.array([0.0, room]), np.array([1.0 + excess, 0.0]), np.ones(2)

@@ -23,12 +23,16 @@ def spec(reach=1.0):
 
 
 def kinematic(period=0.05, **settings):
-    return build_kinematic(configure(KinematicConfig, **settings), PlantSetup(nominal_ur5(), START, period))
+    return build_kinematic(
+        configure(KinematicConfig, **settings), PlantSetup(nominal_ur5(), START, period)
+    )
 
 
 def probe(plant, seed=0, **settings):
     """Run a provider on a plant until it is done."""
-    provider = initial_jacobian(InitialConfig(source="probe", **settings), RobotKnowledge(plant.spec, 0))
+    provider = initial_jacobian(
+        InitialConfig(source="probe", **settings), RobotKnowledge(plant.spec, 0)
+    )
     observation = plant.reset(seed)
     state, periods = provider.start(observation), 0
     while True:
@@ -70,8 +74,12 @@ def test_lost_frames_prolong_probing_and_do_no_harm():
 
 
 def test_frames_slower_than_the_control_prolong_a_rest_until_there_are_three():
-    assert probe(kinematic(0.01, frame_period=0.05))[1] * 0.01 == pytest.approx(7 * 0.15 + 6 * 0.45, abs=0.4)
-    assert probe(kinematic(0.01, frame_period=0.2))[1] * 0.01 == pytest.approx(7 * 0.6 + 6 * 0.4, abs=0.6)
+    assert probe(kinematic(0.01, frame_period=0.05))[1] * 0.01 == pytest.approx(
+        7 * 0.15 + 6 * 0.45, abs=0.4
+    )
+    assert probe(kinematic(0.01, frame_period=0.2))[1] * 0.01 == pytest.approx(
+        7 * 0.6 + 6 * 0.4, abs=0.6
+    )
 
 
 def test_the_matrix_of_a_model_is_stored_by_rows_whatever_the_layout_that_the_model_returns():
@@ -85,7 +93,9 @@ def test_the_matrix_of_a_model_is_stored_by_rows_whatever_the_layout_that_the_mo
 
 
 def test_a_probing_move_turns_away_from_a_joint_limit():
-    provider = initial_jacobian(InitialConfig("probe", average_time=0.05), RobotKnowledge(spec(), 0))
+    provider = initial_jacobian(
+        InitialConfig("probe", average_time=0.05), RobotKnowledge(spec(), 0)
+    )
     at = Observation(0.0, np.array([0.99, 0.0]), np.zeros(1))
     _, u, _ = provider.step(provider.start(at), at)
     np.testing.assert_allclose(u, [-0.3, 0.0])
@@ -108,7 +118,8 @@ def test_a_joint_that_does_not_move_is_a_named_fault():
 def test_a_controller_says_that_it_probes_and_servoes_afterwards():
     entry, plant = compose("mfac", "kalman"), kinematic()
     controller = entry.build(
-        replace(entry.config(), initial=InitialConfig(source="probe")), RobotKnowledge(plant.spec, 0)
+        replace(entry.config(), initial=InitialConfig(source="probe")),
+        RobotKnowledge(plant.spec, 0),
     )
     observation = plant.reset(1)
     controller.reset(observation, 1)
@@ -122,8 +133,12 @@ def test_a_controller_says_that_it_probes_and_servoes_afterwards():
 
 
 def test_a_nominal_model_of_another_robot_is_refused():
-    provider = initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: np.zeros((3, 6))))
-    with pytest.raises(ValueError, match=r"nominal_jacobian must return shape \(1, 2\), got \(3, 6\)"):
+    provider = initial_jacobian(
+        InitialConfig(), RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: np.zeros((3, 6)))
+    )
+    with pytest.raises(
+        ValueError, match=r"nominal_jacobian must return shape \(1, 2\), got \(3, 6\)"
+    ):
         provider.start(Observation(0.0, np.zeros(2), np.zeros(1)))
 
 
@@ -131,8 +146,12 @@ def test_a_nominal_model_of_another_robot_is_refused():
     ("config", "jacobian"),
     [(InitialConfig(), [[0.2, 0.6]]), (InitialConfig("given", given=((1.0, 2.0),)), [[1.0, 2.0]])],
 )
-def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_taken_as_it_is(config, jacobian):
-    provider = initial_jacobian(config, RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :]))
+def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_taken_as_it_is(
+    config, jacobian
+):
+    provider = initial_jacobian(
+        config, RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :])
+    )
     assert provider.immediate
     state = provider.start(Observation(0.0, np.array([0.1, 0.3]), np.zeros(1)))
     np.testing.assert_array_equal(provider.jacobian(state), jacobian)
@@ -141,9 +160,17 @@ def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_tak
 @pytest.mark.parametrize(
     ("settings", "reach", "message"),
     [
-        ({}, 1.0, r"source 'nominal' needs a nominal model.*set initial.source to 'probe' or 'given'"),
+        (
+            {},
+            1.0,
+            r"source 'nominal' needs a nominal model.*set initial.source to 'probe' or 'given'",
+        ),
         *(
-            ({"source": "given", "given": given}, 1.0, "^initial.given must hold 1 rows of 2 entries")
+            (
+                {"source": "given", "given": given},
+                1.0,
+                "^initial.given must hold 1 rows of 2 entries",
+            )
             for given in ((), ((1.0,),), ((1.0, 2.0), (3.0,)))
         ),
         ({"source": "probe", "probe_step": 0.2}, 1.0, r"probe_step must be at most 0\.1 rad"),
@@ -156,4 +183,6 @@ def test_a_source_that_does_not_fit_the_robot_is_refused(settings, reach, messag
 
 
 def test_a_probing_move_of_half_the_joint_range_is_taken():
-    assert initial_jacobian(InitialConfig(source="probe", probe_step=0.03), RobotKnowledge(spec(0.03), 0))
+    assert initial_jacobian(
+        InitialConfig(source="probe", probe_step=0.03), RobotKnowledge(spec(0.03), 0)
+    )

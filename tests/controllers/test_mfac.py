@@ -18,10 +18,14 @@ HALF = math.log(2.0) / PERIOD  # [1/s] ρ = ½
 
 def fresh(n, m, limit=1e6, preview=1, **settings):
     knowledge = RobotKnowledge(plant_spec(n, m, limit), preview)
-    return Commanding(MfacLaw(MfacConfig(**settings), knowledge), seen(np.zeros(n), np.zeros(m)), knowledge)
+    return Commanding(
+        MfacLaw(MfacConfig(**settings), knowledge), seen(np.zeros(n), np.zeros(m)), knowledge
+    )
 
 
-@given(seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4), lam=st.floats(1e-3, 10.0))
+@given(
+    seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4), lam=st.floats(1e-3, 10.0)
+)
 def test_the_step_minimises_error_plus_weighted_motion(seed, n, m, lam):
     rng = np.random.default_rng(seed)
     J, e = rng.normal(size=(m, n)), rng.normal(size=m)
@@ -39,7 +43,9 @@ def test_with_the_exact_jacobian_and_no_weight_an_affine_plant_arrives_in_one_st
 
 
 @given(seed=st.integers(0, 10**6), degrees=st.integers(0, 180), share=st.floats(0.01, 0.99))
-def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_derivations_says(seed, degrees, share):
+def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_derivations_says(
+    seed, degrees, share
+):
     rng, turn = np.random.default_rng(seed), math.radians(degrees)
     J, R = rng.normal(size=(3, 6)), Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
     law = fresh(6, 3, gain=-math.log1p(-share) / PERIOD, step_weight=1e-13)
@@ -50,7 +56,9 @@ def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_derivations_say
         factors.append(np.linalg.norm(error - R @ J @ u * PERIOD))
     assert factors[0] == pytest.approx(abs(1.0 - share * np.exp(1j * turn)), rel=1e-6)
     assert factors[1] == pytest.approx(1.0 - share, rel=1e-6)
-    assert (factors[0] < 1.0) == (share < 2.0 * math.cos(turn)) or abs(share - 2.0 * math.cos(turn)) < 1e-6
+    assert (factors[0] < 1.0) == (share < 2.0 * math.cos(turn)) or abs(
+        share - 2.0 * math.cos(turn)
+    ) < 1e-6
 
 
 def test_the_first_step_equals_the_one_computed_by_hand():

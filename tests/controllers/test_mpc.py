@@ -26,7 +26,10 @@ def make_spec(n=6, m=3, **limits):
 
 
 def observe(spec, position=None, feature=None):
-    return seen(np.zeros(spec.n) if position is None else position, np.zeros(spec.m) if feature is None else feature)
+    return seen(
+        np.zeros(spec.n) if position is None else position,
+        np.zeros(spec.m) if feature is None else feature,
+    )
 
 
 def blocks(count):
@@ -46,7 +49,9 @@ def random_jacobian(seed, m=3, n=6):
     return np.random.default_rng(seed).normal(scale=0.4, size=(m, n))
 
 
-def program(n=4, m=2, horizon=5, constant=False, move=1e3, change=1e3, view=False, solver="daqp", seed=0):
+def program(
+    n=4, m=2, horizon=5, constant=False, move=1e3, change=1e3, view=False, solver="daqp", seed=0
+):
     rng = np.random.default_rng(seed)
     shape = QpShape(
         weights=move_weights(horizon, 0.9, 1.0),
@@ -74,7 +79,9 @@ def test_first_step_of_the_constant_mode_by_hand():
     np.testing.assert_allclose(velocity, [dq / PERIOD], rtol=1e-9)
     # The criterion ½ (a + q) dq² − (b − c) e dq is least there; two blocks go 2 dq.
     assert law.diagnostics()["objective"] == pytest.approx(-1.5 * dq**2, rel=1e-9)
-    assert law.diagnostics()["predicted_terminal_error"] == pytest.approx(abs(0.3 - 2.0 * dq), rel=1e-9)
+    assert law.diagnostics()["predicted_terminal_error"] == pytest.approx(
+        abs(0.3 - 2.0 * dq), rel=1e-9
+    )
 
 
 def test_first_step_of_free_moves_by_hand():
@@ -89,7 +96,9 @@ def test_first_step_of_free_moves_by_hand():
 def test_a_joint_of_twice_the_weight_moves_less():
     # As above with q = 2 for the second joint alone: dq = J Q⁻¹ 0.1 / (1 + J Q⁻¹ Jᵀ), J = [2, 2].
     spec = make_spec(2, 1)
-    law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0, joint_weight=(1.0, 2.0))
+    law = make_law(
+        spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0, joint_weight=(1.0, 2.0)
+    )
     velocity = law.command(Estimate(np.array([[2.0, 2.0]])), observe(spec), hold([0.2]))
     np.testing.assert_allclose(velocity * PERIOD, [0.2 / 7.0, 0.1 / 7.0], rtol=1e-9)
 
@@ -99,9 +108,17 @@ def test_a_joint_of_twice_the_weight_moves_less():
 def test_both_solvers_find_the_same_plan_multipliers_and_criterion(constant, seed):
     found = []
     for solver in ("daqp", "qpoases"):
-        qp, shape = program(solver=solver, constant=constant, move=0.3, change=0.12, view=True, seed=seed)
-        targets = np.random.default_rng(seed).normal(size=(shape.moves, 2)) * (40.0 if constant else 1.0)
-        found.append(qp.solve(random_jacobian(seed, 2, 4), targets, make_bounds(shape, travel=0.7, margin=-0.2)))
+        qp, shape = program(
+            solver=solver, constant=constant, move=0.3, change=0.12, view=True, seed=seed
+        )
+        targets = np.random.default_rng(seed).normal(size=(shape.moves, 2)) * (
+            40.0 if constant else 1.0
+        )
+        found.append(
+            qp.solve(
+                random_jacobian(seed, 2, 4), targets, make_bounds(shape, travel=0.7, margin=-0.2)
+            )
+        )
         assert found[-1].success
         assert found[-1].iterations > 0
     one, other = found
@@ -117,7 +134,9 @@ def test_the_objective_is_the_criterion_of_the_moves(solver):
     J, targets = random_jacobian(0, 2, 4), np.random.default_rng(0).normal(size=(shape.moves, 2))
     found = qp.solve(J, targets, make_bounds(shape, travel=0.7))
     missed = targets - np.cumsum(found.moves, axis=0) @ J.T
-    criterion = 0.5 * (np.sum(shape.weights @ missed**2) + np.sum(found.moves**2 @ shape.move_weight))
+    criterion = 0.5 * (
+        np.sum(shape.weights @ missed**2) + np.sum(found.moves**2 @ shape.move_weight)
+    )
     assert found.objective == pytest.approx(criterion, rel=1e-9)
 
 
@@ -142,7 +161,9 @@ BREACHES = {  # one limit each: first moves, later ones, and the ways of two joi
 
 
 def test_a_plan_is_checked_against_every_limit_for_each_run():
-    shape = QpShape(np.ones(3), np.ones(2), None, np.ones(2), np.full(2, 0.5), True, np.array([[1.0, 1.0]]))
+    shape = QpShape(
+        np.ones(3), np.ones(2), None, np.ones(2), np.full(2, 0.5), True, np.array([[1.0, 1.0]])
+    )
     count = len(BREACHES)
     bounds = QpBounds(
         *(np.full((count, 2), value) for value in (-0.5, 0.5, -2.0, 2.0)),
@@ -151,7 +172,9 @@ def test_a_plan_is_checked_against_every_limit_for_each_run():
     plans = np.array(list(BREACHES.values()))
     broken = exceeds(shape, bounds, np.eye(2), plans, np.cumsum(plans, axis=1))
     assert broken.tolist() == [False] + [True] * (count - 1)
-    unlimited = replace(shape, largest_change=None, limit_position=False, view_rows=np.zeros((0, 2)))
+    unlimited = replace(
+        shape, largest_change=None, limit_position=False, view_rows=np.zeros((0, 2))
+    )
     broken = exceeds(unlimited, bounds, np.eye(2), plans, np.cumsum(plans, axis=1))
     assert broken.tolist() == [name == "a move" for name in BREACHES]
 
@@ -161,7 +184,10 @@ def test_a_plan_is_checked_against_every_limit_for_each_run():
 def test_position_rows_out_of_reach_change_nothing(constant, travel):
     # Five moves of at most 0.3 rad reach 1.5 rad: a limit at 1.6 rad is left out, nearer ones are not.
     qp, shape = program(constant=constant, move=0.3)
-    J, targets = random_jacobian(1, 2, 4), np.full((shape.moves, 2), 3.0 * (40.0 if constant else 1.0))
+    J, targets = (
+        random_jacobian(1, 2, 4),
+        np.full((shape.moves, 2), 3.0 * (40.0 if constant else 1.0)),
+    )
     found = qp.solve(J, targets, make_bounds(shape, travel=travel))
     far = qp.solve(J, targets, make_bounds(shape, travel=1e3))
     rows = found.multiplier.size - far.multiplier.size
@@ -169,7 +195,9 @@ def test_position_rows_out_of_reach_change_nothing(constant, travel):
     if travel > 1.5:
         np.testing.assert_array_equal(found.moves, far.moves)
     else:
-        assert np.abs(found.moves.sum(axis=0) * (5 / shape.moves)).max() == pytest.approx(travel, abs=1e-9)
+        assert np.abs(found.moves.sum(axis=0) * (5 / shape.moves)).max() == pytest.approx(
+            travel, abs=1e-9
+        )
 
 
 def test_solvers_print_nothing_and_keep_nothing_of_the_solve_before(capfd):
@@ -194,7 +222,9 @@ def test_a_moving_reference_is_met_with_the_feedforward_of_its_preview():
     J = np.eye(2)
     for mode in ("moves", "constant"):
         law = make_law(spec, mode=mode, move_weight=1e-9)
-        np.testing.assert_allclose(law.command(Estimate(J), observe(spec), ramp) * PERIOD, [0.01, -0.02], rtol=1e-6)
+        np.testing.assert_allclose(
+            law.command(Estimate(J), observe(spec), ramp) * PERIOD, [0.01, -0.02], rtol=1e-6
+        )
     held = make_law(spec, preview=0, use_preview=False)
     np.testing.assert_allclose(held.command(Estimate(J), observe(spec), ramp[:1]), 0.0, atol=1e-12)
 
@@ -206,7 +236,9 @@ def test_position_limits_are_kept_and_an_arm_outside_may_return(mode):
     near = law.command(Estimate(np.array([[1.0]])), observe(spec, np.array([0.99])), hold([5.0]))
     assert 0.0 < near[0] <= 0.01 / PERIOD + 1e-7
     outside = observe(spec, np.array([1.2]))
-    assert law.command(Estimate(np.array([[1.0]])), outside, hold([5.0]))[0] == pytest.approx(0.0, abs=1e-7)
+    assert law.command(Estimate(np.array([[1.0]])), outside, hold([5.0]))[0] == pytest.approx(
+        0.0, abs=1e-7
+    )
     assert law.command(Estimate(np.array([[1.0]])), outside, hold([-5.0]))[0] < -0.1
     assert law.diagnostics()["solver_success"] == 1.0
     free = make_law(spec, mode=mode, limit_position=False)
@@ -246,7 +278,9 @@ def test_states_of_single_runs_can_be_stacked():
     goes_on.command(Estimate(J), observation, hold(observation.feature))
     both = goes_on.law.diagnostics(stack([goes_on.state, fell_back.state]))
     for name, value in both.items():
-        np.testing.assert_array_equal(value, [goes_on.diagnostics()[name], fell_back.diagnostics()[name]])
+        np.testing.assert_array_equal(
+            value, [goes_on.diagnostics()[name], fell_back.diagnostics()[name]]
+        )
     assert both["fallbacks"].tolist() == [0.0, 1.0]
 
 
@@ -288,7 +322,10 @@ def test_a_jacobian_of_zeros_asks_for_nothing():
     spec = make_spec()
     for mode in ("moves", "constant"):
         np.testing.assert_allclose(
-            make_law(spec, mode=mode).command(Estimate(np.zeros((3, 6))), observe(spec), hold([1, 2, 3])), 0
+            make_law(spec, mode=mode).command(
+                Estimate(np.zeros((3, 6))), observe(spec), hold([1, 2, 3])
+            ),
+            0,
         )
 
 
@@ -303,13 +340,23 @@ def test_the_predicted_error_is_from_the_reference_at_the_end_of_the_horizon():
 
 def test_settings_that_do_not_fit_the_plant_are_named():
     config = MpcConfig()
-    with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"):
+    with pytest.raises(
+        ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"
+    ):
         MpcLaw(config, RobotKnowledge(make_spec(), 9))
-    with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.65 s, got 10 rows of 0.05 s"):
+    with pytest.raises(
+        ValueError,
+        match=r"preview must reach horizon_time \+ delay = 0.65 s, got 10 rows of 0.05 s",
+    ):
         MpcLaw(replace(config, delay=0.15), RobotKnowledge(make_spec(), 10))
-    with pytest.raises(ValueError, match="view_tangent needs the 3 features x, y, z, got 2 features"):
+    with pytest.raises(
+        ValueError, match="view_tangent needs the 3 features x, y, z, got 2 features"
+    ):
         MpcLaw(replace(config, view_tangent=(0.5, 0.5)), RobotKnowledge(make_spec(m=2), 10))
-    with pytest.raises(ValueError, match=r"forgetting must be at most 400 1/s for blocks of 0.05 s.*; got 1e\+06 1/s"):
+    with pytest.raises(
+        ValueError,
+        match=r"forgetting must be at most 400 1/s for blocks of 0.05 s.*; got 1e\+06 1/s",
+    ):
         MpcLaw(replace(config, forgetting=1e6), RobotKnowledge(make_spec(), 10))
     assert np.isfinite(make_law(make_spec(), forgetting=400.0).law._integrals).all()
     with pytest.raises(ValueError, match=r"joint_weight must have shape \(6,\), got \(2,\)"):
@@ -319,7 +366,11 @@ def test_settings_that_do_not_fit_the_plant_are_named():
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 @pytest.mark.parametrize("period", [0.02, 0.008, 0.004])
 def test_the_control_rate_changes_neither_the_plan_nor_the_command(mode, period):
-    J, y, sent = random_jacobian(4), np.array([0.1, -0.2, 0.05]), np.array([0.1, 0.0, -0.2, 0.3, 0.0, 0.1])
+    J, y, sent = (
+        random_jacobian(4),
+        np.array([0.1, -0.2, 0.05]),
+        np.array([0.1, 0.0, -0.2, 0.3, 0.0, 0.1]),
+    )
     commands = []
     for rate in (PERIOD, period):
         spec = replace(make_spec(speed=0.5), period=rate)
@@ -351,9 +402,9 @@ def test_the_optimum_in_continuous_time_does_not_depend_on_the_length_of_the_blo
     # In constant mode the integrals are exact, in the other one the sums tend to them.
     J, spec = random_jacobian(5), replace(make_spec(speed=1e3, reach=1e3), period=0.025)
     found = [
-        make_law(spec, mode=mode, moves=count, decay=2.0, move_weight=5.0, terminal_weight=1.0).command(
-            Estimate(J), observe(spec), hold([0.1, -0.2, 0.05])
-        )
+        make_law(
+            spec, mode=mode, moves=count, decay=2.0, move_weight=5.0, terminal_weight=1.0
+        ).command(Estimate(J), observe(spec), hold([0.1, -0.2, 0.05]))
         for count in (10, moves)
     ]
     np.testing.assert_allclose(found[1], found[0], rtol=1e-9 if mode == "constant" else 0.15)
@@ -375,7 +426,9 @@ def test_a_b_and_c_equal_quadrature(alpha, horizon):
     for rho in (1e-9, 1e-4, 0.01, 0.2, 5.0):
         found = horizon_integrals(horizon, alpha, rho)
         beta = np.exp(-rho)
-        assert found.c == pytest.approx(integral(lambda t, beta=beta: t * (alpha * beta) ** t, horizon), rel=1e-10)
+        assert found.c == pytest.approx(
+            integral(lambda t, beta=beta: t * (alpha * beta) ** t, horizon), rel=1e-10
+        )
 
 
 def test_extreme_forgetting_stays_finite():
@@ -392,7 +445,8 @@ def test_preview_weights_integrate_a_broken_line_exactly(alpha):
     r[0] = 0.0
     nodes = np.arange(horizon + 1)
     pieces = [
-        quad(lambda t: t * alpha**t * np.interp(t, nodes, r), start, start + 1, epsabs=1e-14)[0] for start in nodes[:-1]
+        quad(lambda t: t * alpha**t * np.interp(t, nodes, r), start, start + 1, epsabs=1e-14)[0]
+        for start in nodes[:-1]
     ]
     assert preview_weights(horizon, alpha) @ r[1:] == pytest.approx(sum(pieces), abs=1e-12)
     # A unit ramp turns ∫ τ α^τ τ dτ into a.

@@ -19,18 +19,29 @@ LIMITS = {
     "acceleration": {"joint_acceleration_limit": 6.0, "limit_position": False},
     "position": {},
     "view": {"view_tangent": (0.3, 0.25), "limit_position": False},
-    "all": {"joint_acceleration_limit": 12.0, "view_tangent": (0.3, 0.25), "forgetting": 2.1, "terminal_weight": 0.5},
+    "all": {
+        "joint_acceleration_limit": 12.0,
+        "view_tangent": (0.3, 0.25),
+        "forgetting": 2.1,
+        "terminal_weight": 0.5,
+    },
 }
 
 
 def gradient(config, J, e, ahead, plan):
     """The gradient of the criterion in the docstring of `MpcLaw`, term by term; the integral by quadrature."""
     H, block = config.moves, config.horizon_time / config.moves
-    beta, alpha, Q = np.exp(-config.decay * block), np.exp(-config.forgetting * block), config.move_weight
+    beta, alpha, Q = (
+        np.exp(-config.decay * block),
+        np.exp(-config.forgetting * block),
+        config.move_weight,
+    )
     knots = np.concatenate([np.zeros((1, len(e))), ahead])
 
     def pull(tau, travel):
-        target = [np.interp(tau, np.arange(H + 1), column) for column in knots.T] + (1.0 - beta**tau) * e
+        target = [np.interp(tau, np.arange(H + 1), column) for column in knots.T] + (
+            1.0 - beta**tau
+        ) * e
         return J.T @ (J @ travel - target)
 
     found = Q * plan
@@ -51,7 +62,8 @@ def half_spaces(config, spec, J, last, q, y, moves):
     """The limits in the docstring of `qp` as A x ≤ b, row by row."""
     A, b, block = [], [], config.horizon_time / config.moves
     most, last = spec.joint_velocity_limit * block, last / spec.period * block
-    stretch = 1.0 if config.mode == "moves" else config.moves  # the one constant step is made H times
+    # The one constant step is made H times
+    stretch = 1.0 if config.mode == "moves" else config.moves
 
     def add(t, direction, bound, before=slice(0)):
         row = np.zeros((moves, spec.n))
@@ -76,7 +88,10 @@ def half_spaces(config, spec, J, last, q, y, moves):
 
 def random_lanes(rng, scale):
     """Return an observation of an arm near its position limits, references and Jacobians."""
-    q, y = rng.uniform(-0.28, 0.28, (LANES, N)), rng.normal(scale=0.25, size=(LANES, M)) + [0.0, 0.0, 1.0]
+    q, y = (
+        rng.uniform(-0.28, 0.28, (LANES, N)),
+        rng.normal(scale=0.25, size=(LANES, M)) + [0.0, 0.0, 1.0],
+    )
     way = rng.normal(scale=0.1 * scale, size=(LANES, 1 + PREVIEW, M)).cumsum(axis=1)
     reference = y[:, None] + scale * rng.normal(size=(LANES, 1, M)) + way
     look = trusted_observation(0.0, q, y, np.full(LANES, True), np.full((LANES, M), True))
@@ -86,9 +101,15 @@ def random_lanes(rng, scale):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 @pytest.mark.parametrize("limits", LIMITS)
-@pytest.mark.parametrize(("scale", "period"), [(1e-3, 0.05), (0.05, 0.05), (1.0, 0.05), (1.0, 0.02), (0.05, 0.0125)])
-def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_documented(mode, limits, scale, period):
-    spec = replace(plant_spec(N, M, reach=0.3 if limits in {"position", "all"} else 6.0), period=period)
+@pytest.mark.parametrize(
+    ("scale", "period"), [(1e-3, 0.05), (0.05, 0.05), (1.0, 0.05), (1.0, 0.02), (0.05, 0.0125)]
+)
+def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_documented(
+    mode, limits, scale, period
+):
+    spec = replace(
+        plant_spec(N, M, reach=0.3 if limits in {"position", "all"} else 6.0), period=period
+    )
     config = MpcConfig(mode=mode, horizon_time=0.3, moves=6, delay=0.1, decay=8.0, **LIMITS[limits])
     law, rng = MpcLaw(config, RobotKnowledge(spec, PREVIEW)), np.random.default_rng(7)
     observation, reference, J = random_lanes(rng, scale)
@@ -97,13 +118,20 @@ def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_
         before = state
         state, velocity = law.command(before, Estimate(J), observation, reference)
         state = law.noted(state, velocity, np.full(LANES, False))
-        y = observation.feature + np.array([J[i] @ before.sent[i].sum(axis=0) for i in range(LANES)])
+        y = observation.feature + np.array(
+            [J[i] @ before.sent[i].sum(axis=0) for i in range(LANES)]
+        )
         places = (config.delay + BLOCK * np.arange(7)) / period
         for i in np.flatnonzero(state.plan.success):
-            rows = np.stack([np.interp(places, np.arange(1 + PREVIEW), line) for line in reference[i].T], axis=-1)
+            rows = np.stack(
+                [np.interp(places, np.arange(1 + PREVIEW), line) for line in reference[i].T],
+                axis=-1,
+            )
             plan = state.plan.moves[i]
             down = gradient(config, J[i], rows[0] - y[i], rows[1:] - rows[0], plan).ravel()
-            A, b = half_spaces(config, spec, J[i], before.last[i], observation.joint_position[i], y[i], len(plan))
+            A, b = half_spaces(
+                config, spec, J[i], before.last[i], observation.joint_position[i], y[i], len(plan)
+            )
             slack = b - A @ plan.ravel()
             assert slack.min() > -1e-8
             touched = A[slack < 1e-8]

@@ -46,7 +46,12 @@ def hold(target, preview=12):
 def test_first_step_by_hand():
     # h(q) = sin q at q = 0, H = 1, β = ½, q = 1e-9: sin(dq) = ½·0.4, so dq = asin 0.2.
     config = NmpcCalibratedConfig(
-        horizon_time=0.05, moves=1, delay=0.0, decay=20 * math.log(2.0), move_weight=1e-9, iterations=20
+        horizon_time=0.05,
+        moves=1,
+        delay=0.0,
+        decay=20 * math.log(2.0),
+        move_weight=1e-9,
+        iterations=20,
     )
     controller = NmpcCalibrated(config, knowledge(plant_spec(1, 1, speed=10.0), casadi.sin))
     command = controller.step(Observation(0.0, [0.0], [0.0]), hold([0.4]))
@@ -70,12 +75,16 @@ def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
         observation = Observation(0.05 * k, q, J @ q + offset)
         state, linear = law.command(state, Estimate(J), observation, reference)
         state = law.noted(state, linear, np.False_)
-        np.testing.assert_allclose(controller.step(observation, reference).joint_velocity, linear, atol=1e-7)
+        np.testing.assert_allclose(
+            controller.step(observation, reference).joint_velocity, linear, atol=1e-7
+        )
         q = q + 0.05 * linear
 
 
 def test_the_plan_minimises_the_nonlinear_criterion():
-    config = NmpcCalibratedConfig(horizon_time=0.2, moves=4, delay=0.0, move_weight=0.01, iterations=50)
+    config = NmpcCalibratedConfig(
+        horizon_time=0.2, moves=4, delay=0.0, move_weight=0.01, iterations=50
+    )
     controller = NmpcCalibrated(config, knowledge())
     y = MODEL.feature(START)
     reference = y + np.linspace(0.0, 1.0, 13)[:, None] * [0.1, -0.08, 0.05]
@@ -99,7 +108,9 @@ def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
     plant = build_kinematic(KinematicConfig(), PlantSetup(MODEL, START, 0.05))
     controller = NmpcCalibrated(NmpcCalibratedConfig(), knowledge())
     angle = 2 * np.pi * np.arange(110) / 200
-    path = MODEL.feature(START) + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros_like(angle)], axis=-1)
+    path = MODEL.feature(START) + np.stack(
+        [0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros_like(angle)], axis=-1
+    )
     observation = plant.reset(0)
     controller.reset(observation, 0)
     errors = []
@@ -118,7 +129,10 @@ def commands(target, *, offset=(0.0, 0.0, 0.0), latency=0.0, disturb=None, perio
     joints, found = [START], []
     for k in range(periods):
         age = round(latency / 0.05) if disturb is None else disturb(k)
-        measured = MODEL.feature(joints[max(0, k - age)] if isinstance(age, int) else joints[k] + age) + offset
+        measured = (
+            MODEL.feature(joints[max(0, k - age)] if isinstance(age, int) else joints[k] + age)
+            + offset
+        )
         observation = Observation(0.05 * k, joints[k], measured)
         found.append(controller.step(observation, hold(target)).joint_velocity)
         joints.append(joints[k] + 0.05 * found[k])
@@ -159,7 +173,9 @@ def test_frames_that_are_late_by_unknown_times_within_known_bounds_disturb_no_mo
     np.testing.assert_allclose(fed_back, alone, atol=1e-9)
     unaware, _ = commands(TARGET, disturb=lambda k: k * k % 3, image=True)
     assert np.abs(unaware - alone).max() > 1e-3
-    np.testing.assert_allclose(exposure_ages(Delays(0.1, 0.0, 0.0, 0.05), 0.05), 2.0 + 0.25 * np.arange(8))
+    np.testing.assert_allclose(
+        exposure_ages(Delays(0.1, 0.0, 0.0, 0.05), 0.05), 2.0 + 0.25 * np.arange(8)
+    )
 
 
 def test_a_camera_that_is_known_to_turn_shows_the_target_in_its_place():
@@ -167,7 +183,9 @@ def test_a_camera_that_is_known_to_turn_shows_the_target_in_its_place():
         return Rotation.from_rotvec([0.0, 0.0, -0.3 * time]).apply(np.array(MODEL.feature(joints)))
 
     for image in (True, False):
-        controller = NmpcCalibrated(NmpcCalibratedConfig(image=image), replace(knowledge(), true_camera_turn=0.3))
+        controller = NmpcCalibrated(
+            NmpcCalibratedConfig(image=image), replace(knowledge(), true_camera_turn=0.3)
+        )
         joints, errors = START, []
         for k in range(60):
             feature = seen(joints, 0.05 * k)
@@ -185,7 +203,9 @@ def test_the_taps_leave_an_oscillator_at_rest_after_a_step():
     A, B = [[0.0, 1.0], [-(omega**2), -2.0 * damping * omega]], [[0.0], [omega**2]]
     step = np.cumsum(np.pad(taps, (0, 1000)))
     swing = lsim((A, B, [[1.0, 0.0]], 0.0), step, period * np.arange(len(step)), interp=False)[1]
-    alone = lsim((A, B, [[1.0, 0.0]], 0.0), np.ones(1000), period * np.arange(1000), interp=False)[1]
+    alone = lsim((A, B, [[1.0, 0.0]], 0.0), np.ones(1000), period * np.arange(1000), interp=False)[
+        1
+    ]
     assert np.abs(swing[len(taps) :] - 1.0).max() < 2e-3
     assert alone.max() > 1.7
 
@@ -199,11 +219,15 @@ def test_the_steps_to_come_behind_a_shaper_are_those_of_a_simulated_pipeline():
 
 
 def test_a_flexible_tool_that_is_known_comes_to_rest_at_the_target():
-    config = KinematicConfig(sensing=SensingConfig(feature_noise=0.0), mechanics=MechanicsConfig(tool_frequency=20.0))
+    config = KinematicConfig(
+        sensing=SensingConfig(feature_noise=0.0), mechanics=MechanicsConfig(tool_frequency=20.0)
+    )
     errors = {}
     for tool in ((0.0, 0.0), (20.0, 0.02)):
         plant = build_kinematic(config, PlantSetup(MODEL, START, 0.05))
-        controller = NmpcCalibrated(NmpcCalibratedConfig(image=True), replace(knowledge(preview=16), true_tool=tool))
+        controller = NmpcCalibrated(
+            NmpcCalibratedConfig(image=True), replace(knowledge(preview=16), true_tool=tool)
+        )
         observation = plant.reset(0)
         for _ in range(40):
             observation = plant.step(controller.step(observation, hold(TARGET, 16)))
@@ -243,9 +267,13 @@ def test_without_a_solution_the_arm_holds_and_it_is_counted_or_it_is_a_named_fai
 
 def test_knowledge_that_does_not_suffice_is_named():
     config = NmpcCalibratedConfig()
-    with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"):
+    with pytest.raises(
+        ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"
+    ):
         NmpcCalibrated(config, knowledge(preview=9))
     with pytest.raises(ValueError, match="true_symbolic must be known for nmpc_calibrated"):
         NmpcCalibrated(config, knowledge(symbolic=None))
-    with pytest.raises(ValueError, match=r"true_symbolic must give an expression of shape \(3, 1\), got \(6, 1\)"):
+    with pytest.raises(
+        ValueError, match=r"true_symbolic must give an expression of shape \(3, 1\), got \(6, 1\)"
+    ):
         NmpcCalibrated(config, knowledge(symbolic=lambda q: q))

@@ -14,7 +14,9 @@ GRID = GUESS * 2.0 ** np.arange(-2, 8)
 
 def learned(level, innovations, multiple, other):
     for nu in innovations:
-        level = level.learn(np.vecdot(nu, nu), np.int_(len(nu)), np.float64(multiple), np.float64(other))
+        level = level.learn(
+            np.vecdot(nu, nu), np.int_(len(nu)), np.float64(multiple), np.float64(other)
+        )
     return level
 
 
@@ -32,18 +34,27 @@ def test_it_is_the_mean_of_the_posterior_on_the_grid():
 
 def test_before_there_is_an_innovation_it_is_the_guess():
     for lead in ((), (2, 3)):
-        np.testing.assert_array_equal(NoiseLevel.start(GUESS, lead).variance, np.full(lead, GUESS**2))
+        np.testing.assert_array_equal(
+            NoiseLevel.start(GUESS, lead).variance, np.full(lead, GUESS**2)
+        )
 
 
 @pytest.mark.parametrize("size", [0.5, 3.0])
 def test_outliers_count_for_no_level_more_than_for_another(size):
     """Their density does not depend on σ: what the other frames told is flattened by forgetting alone."""
     rng = np.random.default_rng(2)
-    level = learned(NoiseLevel.start(GUESS), np.sqrt(2.0) * 2.0 * GUESS * rng.normal(size=(100, 3)), 2.0, 0.0)
+    level = learned(
+        NoiseLevel.start(GUESS), np.sqrt(2.0) * 2.0 * GUESS * rng.normal(size=(100, 3)), 2.0, 0.0
+    )
     after = learned(level, size * rng.normal(size=(5, 3)), 2.0, 0.0)
     np.testing.assert_allclose(after.scores, 0.99**5 * level.scores, rtol=1e-9, atol=1e-9)
     assert after.deviation == pytest.approx(level.deviation, rel=0.02)
-    share = np.mean([learned(NoiseLevel.start(GUESS), part, 2.0, 0.0).deviation for part in frames_with_outliers(rng)])
+    share = np.mean(
+        [
+            learned(NoiseLevel.start(GUESS), part, 2.0, 0.0).deviation
+            for part in frames_with_outliers(rng)
+        ]
+    )
     assert share == pytest.approx(2.0 * GUESS, rel=0.2)
 
 
@@ -62,7 +73,9 @@ def test_the_same_frame_again_teaches_nothing():
 
 def test_an_innovation_without_noise_of_frames_says_nothing_of_it():
     level = learned(NoiseLevel.start(GUESS), [np.full(3, 2e-3)], 2.0, 0.0)
-    np.testing.assert_allclose(learned(level, [np.full(3, 1e-3)], 0.0, 1e-6).scores, 0.99 * level.scores, atol=1e-9)
+    np.testing.assert_allclose(
+        learned(level, [np.full(3, 1e-3)], 0.0, 1e-6).scores, 0.99 * level.scores, atol=1e-9
+    )
 
 
 LANES = 2_000  # numpy's power of a number differs from that of an array once in so many
@@ -74,7 +87,9 @@ def test_many_lanes_have_the_bits_of_each_alone():
     multiple, count = rng.uniform(1.0, 2.0, LANES), rng.integers(1, 4, LANES)
     square[::7] = 0.0
     level = (
-        NoiseLevel.start(GUESS, (LANES,)).learn(square, count, multiple, other).learn(other, count, multiple, square)
+        NoiseLevel.start(GUESS, (LANES,))
+        .learn(square, count, multiple, other)
+        .learn(other, count, multiple, square)
     )
     for lane in range(LANES):
         a, b, c, d = square[lane], other[lane], count[lane], multiple[lane]

@@ -23,11 +23,15 @@ class Following:
 
     def __init__(self, period=PERIOD, latency=0.0, **aids):
         knowledge = dataclasses.replace(
-            KNOWLEDGE, spec=dataclasses.replace(SPEC, period=period), nominal_jacobian=NETWORK.jacobian
+            KNOWLEDGE,
+            spec=dataclasses.replace(SPEC, period=period),
+            nominal_jacobian=NETWORK.jacobian,
         )
         self.period, self.k, self.state = period, 0, None
         delays = Delays(latency, 0.0, 0.0)
-        self.stages = Estimation(ConstantEstimator(), knowledge, AidsConfig(**{**MAPPED, **aids}), delays)
+        self.stages = Estimation(
+            ConstantEstimator(), knowledge, AidsConfig(**{**MAPPED, **aids}), delays
+        )
 
     def see(self, q, y, valid=True):
         look = Observation(self.k * self.period, q, y, valid)
@@ -54,7 +58,9 @@ class Following:
         return np.linalg.norm(self.state.jacobian - true) / np.linalg.norm(true)
 
 
-@pytest.mark.parametrize(("period", "latency"), [(0.1, 0.2), (0.05, 0.15), (0.008, 0.12), (0.004, 0.12), (0.004, 0.0)])
+@pytest.mark.parametrize(
+    ("period", "latency"), [(0.1, 0.2), (0.05, 0.15), (0.008, 0.12), (0.004, 0.12), (0.004, 0.0)]
+)
 def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
     q = path(4.0, period)
     noise = 2e-4 * np.random.default_rng(0).normal(size=(len(q), M))
@@ -62,14 +68,17 @@ def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
     assert made.found["delay"] == pytest.approx(latency, abs=1.5 * max(period, 0.25 / 24))
     assert made.found["map_rotation"] == pytest.approx(2.0 * np.pi / 3.0, abs=0.1)
     assert len(made.pair.scores) <= 25
-    assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1  # the delay may lie between two candidates
+    # The delay may lie between two candidates
+    assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1
 
 
 @pytest.mark.parametrize(("period", "latency"), [(0.05, 0.025), (0.05, 0.0875), (0.02, 0.05)])
 def test_a_latency_between_two_periods_is_found(period, latency):
     fine, parts = path(4.0, period / 8), 8
     y = late_features(fine, TURN, round(parts * latency / period))[::parts]
-    made = Following(period).follow(fine[::parts], y + 2e-4 * np.random.default_rng(0).normal(size=y.shape))
+    made = Following(period).follow(
+        fine[::parts], y + 2e-4 * np.random.default_rng(0).normal(size=y.shape)
+    )
     assert made.found["delay"] == pytest.approx(latency, abs=1.01 * pairing.RESOLUTION)
     assert made.error(TURN @ NETWORK.jacobian(fine[-1])) < 0.1
 
@@ -100,7 +109,9 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
     rng, sigma, count = np.random.default_rng(4), 0.025, 10
     q = np.concatenate([np.zeros((1, N)), np.cumsum(rng.choice([-0.03, 0.03], (count, N)), axis=0)])
     y = late_features(q, np.eye(M), 1) + sigma * rng.normal(size=(count + 1, M))
-    made = Following(noise="given", feature_noise=sigma, longest_delay=0.2, delay_margin=0.0).follow(q, y)
+    made = Following(
+        noise="given", feature_noise=sigma, longest_delay=0.2, delay_margin=0.0
+    ).follow(q, y)
     J, dq, wanted = NETWORK.jacobian(q), np.diff(q, axis=0), []
     x = np.matvec((J[1:] + J[:-1]) / 2.0, dq)
     for d in range(5):
@@ -108,13 +119,23 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
         lengths, turns = np.linalg.norm(H[:, :M], axis=1), np.linalg.norm(H[:, M:], axis=1)
         assert (lengths[d:] > sigma).all()
         S = sigma**2 * (2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
-        S += np.diag((pairing.MODEL_ERROR * lengths) ** 2) + pairing.MAP_DEVIATION**2 * H[:, :M] @ H[:, :M].T
+        S += (
+            np.diag((pairing.MODEL_ERROR * lengths) ** 2)
+            + pairing.MAP_DEVIATION**2 * H[:, :M] @ H[:, :M].T
+        )
         S += pairing.REST_DEVIATION**2 * H[:, M:] @ H[:, M:].T
-        for part, walk, way in ((H[:, :M], pairing.MAP_WALK, lengths), (H[:, M:], pairing.REST_WALK, turns)):
+        for part, walk, way in (
+            (H[:, :M], pairing.MAP_WALK, lengths),
+            (H[:, M:], pairing.REST_WALK, turns),
+        ):
             S += walk**2 * np.minimum.outer(np.cumsum(way), np.cumsum(way)) * (part @ part.T)
-        density = multivariate_normal(np.zeros(count), S).logpdf((np.diff(y, axis=0) - H[:, :M]).T).sum()
+        density = (
+            multivariate_normal(np.zeros(count), S).logpdf((np.diff(y, axis=0) - H[:, :M]).T).sum()
+        )
         wanted.append(-2.0 * density)
-    np.testing.assert_allclose(made.pair.scores - made.pair.scores[0], np.array(wanted) - wanted[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        made.pair.scores - made.pair.scores[0], np.array(wanted) - wanted[0], rtol=1e-6
+    )
     assert made.pair.candidate == np.argmin(wanted) == 1
 
 
@@ -165,7 +186,10 @@ def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
 
 def test_the_fifth_false_frame_in_a_row_is_believed():
     q = path(1.6)
-    y, doubted = late_features(q, np.eye(M), 0) + np.where(np.arange(len(q)) < 12, 0.0, 0.3)[:, None], []
+    y, doubted = (
+        late_features(q, np.eye(M), 0) + np.where(np.arange(len(q)) < 12, 0.0, 0.3)[:, None],
+        [],
+    )
     made = Following(noise="given", feature_noise=5e-4).follow(q[:12], y[:12])
     for k in range(12, 17):
         made.see(q[k], y[k])
@@ -194,7 +218,10 @@ def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(p
     made = Following(period).follow(q[: lost.stop], y[: lost.stop], valid)
     before = made.pair
     made.see(q[lost.stop], y[lost.stop] + 0.3)
-    for now, then in ((made.pair.bank, before.bank), (made.pair.regression.bank, before.regression.bank)):
+    for now, then in (
+        (made.pair.bank, before.bank),
+        (made.pair.regression.bank, before.regression.bank),
+    ):
         np.testing.assert_array_equal(now[:, :-1, :-1], then[:, :-1, :-1])
         assert not now[:, :-1, -1].any()  # the noise of the frame before the gap is in no motion
     made.follow(q[lost.stop + 1 :], y[lost.stop + 1 :] + 0.3)
@@ -236,7 +263,9 @@ def test_the_delay_is_found_where_the_jacobian_is_only_the_nominal_one():
     np.testing.assert_array_equal(made.state.jacobian, NETWORK.jacobian(q[-1]))
 
 
-def test_a_model_that_is_wrong_by_more_than_a_map_hides_neither_the_delay_nor_the_noise(monkeypatch):
+def test_a_model_that_is_wrong_by_more_than_a_map_hides_neither_the_delay_nor_the_noise(
+    monkeypatch,
+):
     """Two columns of the Jacobian differ: without E what a map leaves passes for noise."""
     rows = NETWORK.weights.copy()
     rows[-2:] *= -0.5
@@ -256,7 +285,10 @@ def test_a_feature_that_is_not_seen_teaches_nothing_whatever_its_last_frame_was(
     """The second feature is lost for a while, after a frame that was an outlier or not: the model hardly differs."""
     q, found = path(3.0), []
     for outlier in (0.0, 0.3):
-        y, made = late_features(q, TURN, 0), Following(delay="given", noise="given", feature_noise=3e-4)
+        y, made = (
+            late_features(q, TURN, 0),
+            Following(delay="given", noise="given", feature_noise=3e-4),
+        )
         y[30, 1] += outlier
         for k in range(len(q)):
             made.see(q[k], y[k], np.array([True, not 30 < k < 40, True]))
@@ -267,7 +299,9 @@ def test_a_feature_that_is_not_seen_teaches_nothing_whatever_its_last_frame_was(
 
 def test_given_noise_is_not_identified():
     stage, q = pairing.Pairing(AidsConfig(filter=True), KNOWLEDGE, 0.0), np.full(N, 0.01)
-    state = stage.advance(stage.start(seen(np.zeros(N), np.zeros(M)), np.ones((M, N))), q, np.ones((M, N)))
+    state = stage.advance(
+        stage.start(seen(np.zeros(N), np.zeros(M)), np.ones((M, N))), q, np.ones((M, N))
+    )
     after, paired = stage.learn(state, np.full(M, 0.06), np.float64(PERIOD), np.full(M, True))
     np.testing.assert_array_equal(after.noise.variance, state.noise.variance)
     assert stage.noise(state) is None

@@ -15,7 +15,10 @@ from servobench.controllers.periods import check_preview, in_periods, sampled
     st.integers(0, 99),
 )
 def test_samples_are_those_of_linear_interpolation(count, shares, lead, seed):
-    rows, places = np.random.default_rng(seed).normal(size=(*lead, count, 2)), np.array(shares) * (count - 1) / 1000
+    rows, places = (
+        np.random.default_rng(seed).normal(size=(*lead, count, 2)),
+        np.array(shares) * (count - 1) / 1000,
+    )
     wanted = np.apply_along_axis(lambda line: np.interp(places, np.arange(count), line), -2, rows)
     np.testing.assert_allclose(sampled(rows, places), wanted, atol=1e-12)
 
@@ -40,6 +43,7 @@ def test_a_preview_that_does_not_reach_far_enough_is_refused():
     check_preview(0.15, 3, 0.05, "what")
     check_preview(0.05, 3, 0.02, "what")
     with pytest.raises(
-        ValueError, match=r"preview must reach what = 0.05 s, got 2 rows of 0.02 s; lengthen run.preview_time"
+        ValueError,
+        match=r"preview must reach what = 0.05 s, got 2 rows of 0.02 s; lengthen run.preview_time",
     ):
         check_preview(0.05, 2, 0.02, "what")

@@ -24,11 +24,16 @@ def fresh(limit=100.0, **settings):
 
 
 def test_the_first_step_equals_the_one_computed_by_hand():
-    law = PidLaw(PidConfig(proportional_gain=-20.0 * np.log(0.9), integral_gain=4.0, damping=0.0), knowledge(n=1, m=1))
+    law = PidLaw(
+        PidConfig(proportional_gain=-20.0 * np.log(0.9), integral_gain=4.0, damping=0.0),
+        knowledge(n=1, m=1),
+    )
     first = seen([0.0], [0.0])
     # γ = 0.1, e = 0.1, I = 0.05 · 0.1 = 0.005, v = 0.1 / 0.05 · 0.1 + 4 · 0.005 = 0.22, u = 0.22 / 0.5
     assert law.start(first).since_feature.shape == ()
-    _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.array([[0.1], [0.7]]))
+    _, u = law.command(
+        law.start(first), Estimate(np.array([[0.5]])), first, np.array([[0.1], [0.7]])
+    )
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
 
@@ -37,7 +42,9 @@ def test_the_derivative_is_the_filtered_difference_of_the_error_and_the_first_er
     # d = 0, then (0.15 · 0 + 0.3 − 0.1) / (0.15 + 0.05) = 1, then (0.15 · 1 + 0.4 − 0.3) / (0.15 + 0.05) = 1.25
     for error, d in ((0.1, 0.0), (0.3, 1.0), (0.4, 1.25)):
         u = law.command(Estimate(J), look([-error, 0.0]), np.zeros((2, 2)))
-        np.testing.assert_allclose(J @ u, [error * (1.0 - np.exp(-0.05)) / 0.05 + d, 0.0], atol=1e-14)
+        np.testing.assert_allclose(
+            J @ u, [error * (1.0 - np.exp(-0.05)) / 0.05 + d, 0.0], atol=1e-14
+        )
 
 
 def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():
@@ -77,6 +84,9 @@ def test_an_invalid_feature_leaves_integral_and_derivative_alone():
 def test_a_feature_that_was_lost_for_a_while_gives_the_derivative_no_kick():
     law, v = fresh(proportional_gain=1e-9, derivative_gain=1.0), []
     for k in range(60):
-        u = law.command(Estimate(J), look([-0.01 * k, 0.0], valid=k < 40 or k == 59), np.zeros((2, 2)))
+        u = law.command(
+            Estimate(J), look([-0.01 * k, 0.0], valid=k < 40 or k == 59), np.zeros((2, 2))
+        )
         v.append((J @ u)[0])
-    np.testing.assert_allclose(v[39:], 0.2, rtol=1e-6)  # 0.01 m per period of 0.05 s, before, during and after the gap
+    # 0.01 m per period of 0.05 s, before, during and after the gap
+    np.testing.assert_allclose(v[39:], 0.2, rtol=1e-6)

@@ -13,7 +13,12 @@ from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.pairing import Past
-from servobench.controllers.stages.prediction import JointResponse, Predictor, shifted, with_response
+from servobench.controllers.stages.prediction import (
+    JointResponse,
+    Predictor,
+    shifted,
+    with_response,
+)
 from servobench.controllers.stages.regression import REST_DRIFT
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
@@ -23,7 +28,10 @@ NO_DELAYS = Delays(0.0, 0.0, 0.0)
 def answered(response, steps=40, length=4, joints=3):
     """A JointResponse that has seen random commands and their answers; and the commands, the newest last."""
     rng = np.random.default_rng(3)
-    made, commands = JointResponse.immediate(length, np.zeros(joints), PERIOD), [np.zeros(joints)] * len(response)
+    made, commands = (
+        JointResponse.immediate(length, np.zeros(joints), PERIOD),
+        [np.zeros(joints)] * len(response),
+    )
     for _ in range(steps):
         made = made.learn(sum(g * commands[-1 - i] for i, g in enumerate(response)))
         commands.append(0.05 * rng.uniform(-1.0, 1.0, joints))
@@ -49,10 +57,19 @@ def test_at_first_an_arm_is_expected_to_follow_at_once():
 @pytest.mark.parametrize("window", [1, 2])
 def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_foreseen(window):
     """Over windows of two periods Δq and dq are sums over two periods, and each row counts half."""
-    rng, prior, q, commands = np.random.default_rng(4), np.array([1.0, 0.0, 0.0]), [0.0] * window, [0.0] * 5
+    rng, prior, q, commands = (
+        np.random.default_rng(4),
+        np.array([1.0, 0.0, 0.0]),
+        [0.0] * window,
+        [0.0] * 5,
+    )
     made, rows, answers = JointResponse.immediate(3, np.zeros(1), PERIOD, window=window), [], []
     for _ in range(15):
-        q.append(q[-1] + float(np.array([0.2, 0.5, 0.3]) @ commands[-1:-4:-1]) + 0.003 * rng.choice([-1.0, 1.0]))
+        q.append(
+            q[-1]
+            + float(np.array([0.2, 0.5, 0.3]) @ commands[-1:-4:-1])
+            + 0.003 * rng.choice([-1.0, 1.0])
+        )
         moved = q[-1] - q[-1 - window]
         row = sum(np.array(commands[-1 - k : -4 - k : -1]) for k in range(window))
         if abs(moved - made.response @ row) >= 0.01 * window * PERIOD:
@@ -63,7 +80,9 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
         made = made.command(np.array([commands[-1]]))
     U = np.array(rows)
     rho = 2e-4 * window**2 * PERIOD * np.diag(np.exp(8.1 * PERIOD * np.arange(3)))
-    expected = np.linalg.solve(U.T @ U / window + rho, U.T @ np.array(answers) / window + rho @ prior)
+    expected = np.linalg.solve(
+        U.T @ U / window + rho, U.T @ np.array(answers) / window + rho @ prior
+    )
     assert (expected > 0.0).all()
     np.testing.assert_allclose(made.response, expected, rtol=1e-9)
 
@@ -72,7 +91,12 @@ def identified(period, window, encoder_step=0.0):
     """Return true and found flight, (..., 3), and the found lead [s], at a delay and a lag of 0.05 s in closed form."""
     rng, count = np.random.default_rng(1), round(0.6 / period)
     true = JointResponse.given(0.05, 0.05, period, round(1.0 / period), np.zeros(3))
-    made, q, past, flights = JointResponse.immediate(count, np.zeros(3), period, window), np.zeros(3), [], []
+    made, q, past, flights = (
+        JointResponse.immediate(count, np.zeros(3), period, window),
+        np.zeros(3),
+        [],
+        [],
+    )
     goal = np.zeros(3)
     for k in range(round(6.0 / period)):
         reached = goal - true.flight()  # what is done of the commands up to now
@@ -90,7 +114,8 @@ def identified(period, window, encoder_step=0.0):
 
 
 @pytest.mark.parametrize(
-    ("period", "window"), [(0.05, 1), (0.02, 1), (0.02, 2), (0.008, 1), (0.008, 6), (0.004, 1), (0.004, 12)]
+    ("period", "window"),
+    [(0.05, 1), (0.02, 1), (0.02, 2), (0.008, 1), (0.008, 6), (0.004, 1), (0.004, 12)],
 )
 def test_the_flight_that_is_found_is_that_of_the_delayed_lag_at_every_rate(period, window):
     wanted, found, lead = identified(period, window)
@@ -113,7 +138,9 @@ class Quadratic:
     def __init__(self, past, time):
         self.pairing, self.kept = self, past
         pair = SimpleNamespace(base=self.ahead(None, NOW)[0])
-        self.state = SimpleNamespace(learned=SimpleNamespace(pair=pair), last=SimpleNamespace(time=np.float64(time)))
+        self.state = SimpleNamespace(
+            learned=SimpleNamespace(pair=pair), last=SimpleNamespace(time=np.float64(time))
+        )
 
     def past(self, pair, q, window):
         return self.kept
@@ -163,7 +190,9 @@ def test_without_a_frame_the_feature_follows_the_joints_from_the_last_one(missin
 
 
 def test_a_feature_that_is_not_seen_follows_the_joints_while_the_others_are_corrected():
-    _, z = predicted(MOVING, seen(NOW, [0.8, 0.9], valid=np.array([True, False])), at(EXPOSED - BEFORE))
+    _, z = predicted(
+        MOVING, seen(NOW, [0.8, 0.9], valid=np.array([True, False])), at(EXPOSED - BEFORE)
+    )
     np.testing.assert_allclose(z, [0.8 - 0.03, at(EXPOSED)[1]])
 
 
@@ -180,12 +209,17 @@ class Seeing:
         config = AidsConfig(**aids)
         self.arm, self.stages = arm, Estimation(ConstantEstimator(), KNOWLEDGE, config, delays)
         self.predictor, self.look = Predictor(config, PERIOD, delays), arm.observe()
-        self.estimation, self.state = self.stages.start(self.look, A), self.predictor.start(self.look)
+        self.estimation, self.state = (
+            self.stages.start(self.look, A),
+            self.predictor.start(self.look),
+        )
 
     def predict(self, noise=0.0):
         look = self.look.with_values(self.look.joint_position, self.look.feature + noise)
         self.estimation = self.stages.update(self.estimation, look, np.zeros(M))
-        self.state, ahead, self.lead, _ = self.predictor.predict(self.state, self.stages, self.estimation, look)
+        self.state, ahead, self.lead, _ = self.predictor.predict(
+            self.state, self.stages, self.estimation, look
+        )
         return ahead
 
     def send(self, step):
@@ -196,7 +230,11 @@ class Seeing:
 @pytest.mark.parametrize("noise", [0.001, 0.008])
 def test_at_rest_the_filter_averages(noise):
     """In the steady state z is noisy by σ √(L/2), with the share L = r √T / σ of each frame."""
-    rng, made, errors = np.random.default_rng(5), Seeing(ToyArm(np.eye(M)), noise="identified", filter=True), []
+    rng, made, errors = (
+        np.random.default_rng(5),
+        Seeing(ToyArm(np.eye(M)), noise="identified", filter=True),
+        [],
+    )
     for _ in range(900):
         errors.append(made.predict(rng.normal(scale=noise, size=M)).feature)
         made.send(np.zeros(N))
@@ -208,13 +246,21 @@ def test_in_motion_the_filter_halves_the_noise_and_an_outlier_does_not_pass():
     found = []
     for filter_ in (True, False):
         rng, errors = np.random.default_rng(6), []
-        made = Seeing(ToyArm(np.eye(M)), delay="given", noise="identified", model="regression", filter=filter_)
+        made = Seeing(
+            ToyArm(np.eye(M)), delay="given", noise="identified", model="regression", filter=filter_
+        )
         for k in range(200):
             noise = rng.normal(scale=0.004, size=M)
-            errors.append(made.predict(noise + (0.3 if k == 150 else 0.0)).feature - made.look.feature)
+            errors.append(
+                made.predict(noise + (0.3 if k == 150 else 0.0)).feature - made.look.feature
+            )
             made.send(0.01 * np.sin(0.1 * k + np.arange(N)))
         found.append(
-            (np.sqrt(np.mean(np.square(errors[50:150]))), np.abs(errors[150]).max(), np.abs(errors[151]).max())
+            (
+                np.sqrt(np.mean(np.square(errors[50:150]))),
+                np.abs(errors[150]).max(),
+                np.abs(errors[151]).max(),
+            )
         )
     (filtered, outlier, after), (measured, whole, _) = found
     assert filtered < 0.5 * measured
@@ -237,10 +283,15 @@ def test_frozen_at_rest_it_filters_as_it_did_when_it_learned():
         made.send(np.zeros(N))
 
 
-@pytest.mark.parametrize("aids", [{"delay": "identified"}, {"delay": "given", "filter": True}], ids=["found", "given"])
+@pytest.mark.parametrize(
+    "aids", [{"delay": "identified"}, {"delay": "given", "filter": True}], ids=["found", "given"]
+)
 def test_the_prediction_is_where_the_arm_ends_up_once_its_response_is_known(aids):
     arm, rng = ToyArm(np.eye(M), (0.0, 0.6, 0.4), latency=2), np.random.default_rng(0)
-    made, joints = Seeing(arm, Delays(0.1, 0.0, 0.0), response="identified", model="nominal", **aids), []
+    made, joints = (
+        Seeing(arm, Delays(0.1, 0.0, 0.0), response="identified", model="nominal", **aids),
+        [],
+    )
     for k in range(60):
         bound = made.predict()
         if k > 30:
@@ -261,7 +312,9 @@ def test_a_given_response_is_that_of_a_delayed_lag(delay, lag):
     held = np.repeat(steps / PERIOD, substeps, axis=0)
     late = np.pad(held, ((round(delay * 1000), 1), (0, 0)))[: len(held) + 1]
     response = [1.0], [lag, 1.0, 0.0] if lag > 0.0 else [1.0, 0.0]
-    moved = np.stack([lsim(response, u, 0.001 * np.arange(len(u)), interp=False)[1] for u in late.T], axis=-1)
+    moved = np.stack(
+        [lsim(response, u, 0.001 * np.arange(len(u)), interp=False)[1] for u in late.T], axis=-1
+    )
     for k, step in enumerate(steps):
         q = moved[substeps * k]
         made.look = seen(q, A @ q, k=k)
@@ -277,7 +330,9 @@ def test_each_half_alone_makes_up_for_its_part():
     """`delay` brings the feature to the present, `response` to where the commands so far will lead."""
     rng = np.random.default_rng(0)
     made = {
-        "delay": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5), 2), Delays(0.1, 0.0, 0.0), delay="given"),
+        "delay": Seeing(
+            ToyArm(np.eye(M), (0.0, 0.5, 0.5), 2), Delays(0.1, 0.0, 0.0), delay="given"
+        ),
         "response": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5)), NO_DELAYS, response="identified"),
     }
     for k in range(40):
@@ -288,18 +343,27 @@ def test_each_half_alone_makes_up_for_its_part():
                 expected = each.arm.end() if half == "response" else A @ each.arm.q
                 np.testing.assert_allclose(bound.feature, expected, atol=1e-3)
                 assert (each.lead > 1.0) == (half == "response")
-                np.testing.assert_array_equal(bound.joint_position == each.look.joint_position, half == "delay")
+                np.testing.assert_array_equal(
+                    bound.joint_position == each.look.joint_position, half == "delay"
+                )
             each.send(step)
 
 
 def test_the_shifted_reference_is_interpolated_and_goes_on():
     reference = np.array([[0.0], [1.0], [4.0], [5.0]])
-    for lead, expected in ((0.0, [0.0, 1.0]), (1.5, [2.5, 4.5]), (2.25, [4.25, 5.25]), (7.5, [9.5, 10.5])):
+    for lead, expected in (
+        (0.0, [0.0, 1.0]),
+        (1.5, [2.5, 4.5]),
+        (2.25, [4.25, 5.25]),
+        (7.5, [9.5, 10.5]),
+    ):
         np.testing.assert_allclose(shifted(reference, np.array(lead), 2)[:, 0], expected)
     np.testing.assert_allclose(shifted(reference[:1], np.array(1.5), 1), [[0.0]])
 
 
-@pytest.mark.parametrize(("aids", "asked"), [({}, 1), ({"filter": True}, 4), ({"model": "regression"}, 4)])
+@pytest.mark.parametrize(
+    ("aids", "asked"), [({}, 1), ({"filter": True}, 4), ({"model": "regression"}, 4)]
+)
 def test_the_nominal_model_is_asked_at_the_start_and_once_a_period_by_the_pair_stage(aids, asked):
     places = []
     knowledge = replace(KNOWLEDGE, nominal_jacobian=lambda q: places.append(q) or A)

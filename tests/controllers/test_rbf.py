@@ -24,7 +24,11 @@ def started(config, net):
 
 def window(net, count, seed=1):
     rng = np.random.default_rng(seed)
-    q, dq, dy = rng.normal(size=(count, net.n)), rng.normal(size=(count, net.n)), rng.normal(size=(count, net.m))
+    q, dq, dy = (
+        rng.normal(size=(count, net.n)),
+        rng.normal(size=(count, net.n)),
+        rng.normal(size=(count, net.m)),
+    )
     return jacobian_features(q, net.centres, net.widths), net.features(q), dq, dy
 
 
@@ -41,14 +45,18 @@ def test_the_gradient_is_that_of_automatic_differentiation():
     Q = 0
     for t in range(5):
         predicted = sum(
-            casadi.reshape(W[i * m * units : (i + 1) * m * units], units, m).T @ casadi.DM(theta[t, i]) * dq[t, i]
+            casadi.reshape(W[i * m * units : (i + 1) * m * units], units, m).T
+            @ casadi.DM(theta[t, i])
+            * dq[t, i]
             for i in range(n)
         )
         Q += casadi.sumsqr(casadi.DM(dy[t]) - predicted)
     expected = casadi.Function("g", [W], [casadi.gradient(Q, W)])(net.weights.ravel())
     errors = dy - np.matvec(net.output(net.rows, layers), dq)
     gradient = net.gradient(errors, dq, layers)
-    np.testing.assert_allclose(-2.0 * gradient.swapaxes(0, 1), np.asarray(expected).reshape(n, m, units), atol=1e-12)
+    np.testing.assert_allclose(
+        -2.0 * gradient.swapaxes(0, 1), np.asarray(expected).reshape(n, m, units), atol=1e-12
+    )
 
 
 def test_the_first_update_equals_the_one_computed_by_hand():
@@ -76,7 +84,9 @@ def test_epsilon_grows_with_the_square_of_the_noise_that_is_known():
 @pytest.mark.parametrize("k2", [0.1, 1.0, 1.9])
 def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
     true, rng = network(seed=5), np.random.default_rng(6)
-    start = JacobianNetwork(true.centres, true.widths, true.weights + rng.normal(size=true.weights.shape))
+    start = JacobianNetwork(
+        true.centres, true.widths, true.weights + rng.normal(size=true.weights.shape)
+    )
     estimator = started(RbfConfig(window=1, k2=k2, epsilon=0.0), start)
     V = np.sum((estimator.state.rows - true.rows) ** 2)
     first = V
@@ -96,7 +106,9 @@ def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
 
 def test_only_the_last_motions_of_the_window_count():
     net, rng = network(), np.random.default_rng(9)
-    motions = [motion(rng.normal(size=3), rng.normal(size=2), q=rng.normal(size=3)) for _ in range(5)]
+    motions = [
+        motion(rng.normal(size=3), rng.normal(size=2), q=rng.normal(size=3)) for _ in range(5)
+    ]
     estimator = started(RbfConfig(window=2), net)
     for each in motions[:-1]:
         estimator.update(each)
@@ -105,7 +117,9 @@ def test_only_the_last_motions_of_the_window_count():
     names = "joint_position", "joint_step", "feature_step"
     q, dq, dy = (np.array([getattr(each, name) for each in motions[-2:]]) for name in names)
     gradient = net.gradient(dy - np.matvec(net.jacobian(q, rows), dq), dq, net.features(q))
-    expected = rows + step_of(jacobian_features(q, net.centres, net.widths), dq, 0.5, 1e-3) * gradient
+    expected = (
+        rows + step_of(jacobian_features(q, net.centres, net.widths), dq, 0.5, 1e-3) * gradient
+    )
     np.testing.assert_allclose(estimator.state.rows, expected, atol=1e-13)
 
 
@@ -116,7 +130,9 @@ def test_what_was_learned_fades_by_its_leak_per_second():
     for estimator in (keeping, fading):
         estimator.update(moved)
     learned, kept = (each.state.rows - net.rows for each in (keeping, fading))
-    np.testing.assert_allclose(kept, np.exp(-leak * moved.duration) * learned, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        kept, np.exp(-leak * moved.duration) * learned, rtol=1e-12, atol=1e-15
+    )
     assert np.abs(learned).max() > 1e-4
 
 
@@ -136,7 +152,9 @@ def test_a_kept_value_is_returned_only_for_the_same_position_and_weights():
 
 
 def started_lyapunov(config, net):
-    return Learning(RbfLyapunovEstimator(config, KNOWLEDGE, only_jacobian(net)), np.zeros((net.m, net.n)))
+    return Learning(
+        RbfLyapunovEstimator(config, KNOWLEDGE, only_jacobian(net)), np.zeros((net.m, net.n))
+    )
 
 
 def test_the_first_lyapunov_update_equals_the_one_computed_by_hand():

@@ -20,7 +20,11 @@ from servobench.controllers.laws.rbfnn import (
     update_share,
     update_step,
 )
-from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
+from servobench.controllers.networks.rbf import (
+    ControllerNetwork,
+    controller_output,
+    information_vector,
+)
 from servobench.controllers.stages.finish import scale_to_limit
 
 ONES = Estimate(np.ones((2, 3)))
@@ -50,7 +54,10 @@ def case(net, seed=1, horizon=4, limit=1e6):
     """Return a random roll-out: Jacobian, histories, reference steps and what came out."""
     rng = np.random.default_rng(seed)
     J = rng.normal(size=(net.m, net.n))
-    history = rng.normal(size=(net.error_history, net.m)), rng.normal(size=(net.position_history, net.n))
+    history = (
+        rng.normal(size=(net.error_history, net.m)),
+        rng.normal(size=(net.position_history, net.n)),
+    )
     steps = 0.1 * rng.normal(size=(horizon, net.m))
     ahead = roll_out(net, net.weights, J, history, steps, np.full(net.n, limit))
     return J, history, steps, ahead
@@ -69,7 +76,11 @@ def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit
         h = np.exp(-np.linalg.norm(xi - net.centres, axis=1) / net.widths**2)
         rest = np.concatenate([np.zeros(net.m * error_history), *q_list[:position_history]])
         h_rest = np.exp(-np.linalg.norm(rest - net.centres, axis=1) / net.widths**2)
-        origin = sum(net.weights[:, j] @ h_rest * rest[j] for j in range(len(xi))) if offset_free else q_list[0]
+        origin = (
+            sum(net.weights[:, j] @ h_rest * rest[j] for j in range(len(xi)))
+            if offset_free
+            else q_list[0]
+        )
         wanted.append(sum(net.weights[:, j] @ h * xi[j] for j in range(len(xi))) - origin)
         dq = scale_to_limit(wanted[t], np.full(net.n, limit))
         e_list, q_list = [e_list[0] + steps[t] - J @ dq, *e_list], [q_list[0] + dq, *q_list]
@@ -88,14 +99,18 @@ def test_the_direction_is_that_of_automatic_differentiation_of_each_term_through
     before = np.vstack([errors[:1], ahead.errors[:-1]])
     for t in range(4):
         outer = casadi.DM(np.outer(ahead.xi[t], ahead.h[t]).ravel())
-        q_cmd = casadi.vertcat(*[casadi.dot(W[i * p * hidden : (i + 1) * p * hidden], outer) for i in range(n)])
+        q_cmd = casadi.vertcat(
+            *[casadi.dot(W[i * p * hidden : (i + 1) * p * hidden], outer) for i in range(n)]
+        )
         q = ahead.xi[t, net.m * 2 : net.m * 2 + n]
         e = casadi.DM(before[t] + steps[t]) - casadi.DM(J) @ (q_cmd - casadi.DM(q))
         criterion += 0.5 * casadi.sumsqr(e)
     function = casadi.Function("g", [W], [criterion, casadi.gradient(criterion, W)])
     value, gradient = function(net.weights.ravel())
     np.testing.assert_allclose(0.5 * np.sum(ahead.errors**2), float(value), rtol=1e-12)
-    np.testing.assert_allclose(descent_direction(J, ahead).ravel(), -np.asarray(gradient)[:, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        descent_direction(J, ahead).ravel(), -np.asarray(gradient)[:, 0], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("k", [0.1, 1.0, 1.7])
@@ -103,7 +118,12 @@ def test_the_direction_is_that_of_automatic_differentiation_of_each_term_through
 def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself(k, row_space_only):
     net = network()
     rng = np.random.default_rng(2)
-    J, q, y, ref = rng.normal(size=(2, 3)), rng.normal(size=3), rng.normal(size=2), rng.normal(size=2)
+    J, q, y, ref = (
+        rng.normal(size=(2, 3)),
+        rng.normal(size=3),
+        rng.normal(size=2),
+        rng.normal(size=2),
+    )
     made = law(net, horizon=1, k=k, epsilon=0.0, row_space_only=row_space_only)
     xi = information_vector((ref - y)[None], q[None])
     before = ref - y - J @ (net.command(xi) - q)
@@ -128,10 +148,15 @@ def test_the_first_step_equals_the_one_computed_by_hand():
 
 
 @pytest.mark.parametrize("far", [1.0, 30.0])
-def test_without_an_error_the_offset_free_law_rests_also_far_from_where_its_network_was_trained(far):
+def test_without_an_error_the_offset_free_law_rests_also_far_from_where_its_network_was_trained(
+    far,
+):
     q, y = np.full(3, far), np.array([0.3, -0.2])
     observation, reference = seen(q, y), np.tile(y, (PREVIEW + 1, 1))
-    printed, ours = (law(network(), offset_free=free).command(ONES, observation, reference) for free in (False, True))
+    printed, ours = (
+        law(network(), offset_free=free).command(ONES, observation, reference)
+        for free in (False, True)
+    )
     assert np.abs(printed).max() > 0.1
     np.testing.assert_array_equal(ours, np.zeros(3))
 
@@ -142,8 +167,15 @@ def null_motion(row_space_only):
     J, J_later = rng.normal(size=(2, 2, 3))
     for _ in range(20):
         made.command(Estimate(J), seen(np.zeros(3) + 0.5, np.zeros(2)), np.ones((PREVIEW + 1, 2)))
-    before = law(network()).command(Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2)))
-    u = made.command(Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))) - before
+    before = law(network()).command(
+        Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))
+    )
+    u = (
+        made.command(
+            Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))
+        )
+        - before
+    )
     return np.linalg.norm(u - np.linalg.pinv(J_later) @ J_later @ u)
 
 
@@ -180,7 +212,9 @@ def test_the_preview_is_used_only_where_it_is_switched_on():
     flat = np.tile(ramp[0], (PREVIEW + 1, 1))
     J, look = np.ones((2, 3)) + np.eye(2, 3), seen(np.zeros(3), np.zeros(2))
     on = [law(network()).command(Estimate(J), look, reference) for reference in (ramp, flat)]
-    off = [without_preview().command(Estimate(J), look, reference) for reference in (ramp, flat[:1])]
+    off = [
+        without_preview().command(Estimate(J), look, reference) for reference in (ramp, flat[:1])
+    ]
     assert not np.allclose(on[0], on[1])
     np.testing.assert_array_equal(off[0], off[1])
     np.testing.assert_array_equal(off[0], on[1])
@@ -201,32 +235,43 @@ def test_weight_norms_are_reported():
     made.command(ONES, seen(np.ones(3), np.zeros(2)), np.full((PREVIEW + 1, 2), 5.0))
     found = made.diagnostics()
     assert made.limited
-    assert found["controller_weight_norm"] == pytest.approx(np.linalg.norm(network().weights + made.state.learned))
+    assert found["controller_weight_norm"] == pytest.approx(
+        np.linalg.norm(network().weights + made.state.learned)
+    )
     assert set(found) >= {"criterion", "step_size", "predicted_error", "learned_weight_norm"}
 
 
 def test_nothing_to_descend_gives_no_step():
     ahead = RollOut(np.zeros((2, 2)), np.ones((2, 5)), np.ones((2, 4)), np.zeros(3))
     assert update_step(descent_direction(np.ones((2, 3)), ahead), ahead, 0.5, 0.0) == 0.0
-    assert controller_output(np.zeros((3, 5, 4)), ahead.xi[0], ahead.h[0]).tolist() == [0.0, 0.0, 0.0]
+    assert controller_output(np.zeros((3, 5, 4)), ahead.xi[0], ahead.h[0]).tolist() == [
+        0.0,
+        0.0,
+        0.0,
+    ]
 
 
 def test_a_short_preview_is_refused():
-    with pytest.raises(ValueError, match="preview must reach the law's horizon = 0.4 s, got 7 rows of 0.05 s"):
+    with pytest.raises(
+        ValueError, match="preview must reach the law's horizon = 0.4 s, got 7 rows of 0.05 s"
+    ):
         RbfnnLaw(RbfnnConfig(horizon=8), knowledge(preview=7), only_controller(network()))
 
 
 def at_rate(rate, net, **config):
     """Return a law that is asked every `rate` seconds, and its preview of a reference at rest."""
     spec = replace(plant_spec(net.n, net.m, 1e6), period=rate)
-    made = RbfnnLaw(RbfnnConfig(**config), RobotKnowledge(spec, math.ceil(0.5 / rate)), only_controller(net))
+    made = RbfnnLaw(
+        RbfnnConfig(**config), RobotKnowledge(spec, math.ceil(0.5 / rate)), only_controller(net)
+    )
     return made, math.ceil(0.5 / rate) + 1
 
 
 def test_every_update_removes_its_part_of_what_the_updates_of_one_step_remove():
     assert update_share(0.1, 0.05, 0.05) == 0.1
     assert (1.0 - update_share(0.4, 0.01, 0.05)) ** 5 == pytest.approx(1.0 - 0.4)
-    assert update_share(0.4, 0.2, 0.05) == 0.4  # an update acts after the delay only, so that no more can be removed
+    # An update acts after the delay only, so that no more can be removed
+    assert update_share(0.4, 0.2, 0.05) == 0.4
     assert update_share(1.7, 0.01, 0.05) == pytest.approx(0.34)
     assert update_share(1.7, 1.0, 0.05) == 1.7
 
@@ -235,7 +280,10 @@ def test_every_update_removes_its_part_of_what_the_updates_of_one_step_remove():
 def test_what_is_seen_at_another_rate_asks_for_the_same_velocity(error_history, position_history):
     # Feature, joints and reference move evenly. Without learning every rate has the same ξ and the same command, and
     # the commanded position may stand in for the measured one.
-    net, J = network(error_history=error_history, position_history=position_history), np.ones((2, 3)) + np.eye(2, 3)
+    net, J = (
+        network(error_history=error_history, position_history=position_history),
+        np.ones((2, 3)) + np.eye(2, 3),
+    )
     velocity, commands, predicted = np.array([0.3, -0.2, 0.1]), [], []
     for rate, position in product((PERIOD, 0.1, 0.02, 0.004), ("measured", "commanded")):
         made, rows = at_rate(rate, net, k=1e-9, position=position)

@@ -24,13 +24,23 @@ TURN = Rotation.from_rotvec([0.4, -0.3, 1.5]).as_matrix()
 def motions(count, m, seed=0):
     """Return regressors, motions of the feature, and the variances of the model."""
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(count, m)), 0.6 * rng.normal(size=(count, m)), rng.uniform(0.1, 2.0, count)
+    return (
+        rng.normal(size=(count, m)),
+        0.6 * rng.normal(size=(count, m)),
+        rng.uniform(0.1, 2.0, count),
+    )
 
 
 def learned(bank, h, dy, model, frame=FRAME, walk=0.0, learns=True):
     """Return one filter of a bank after one motion, and its innovation."""
     made, found = learn(
-        bank[None], h[None], dy, np.float64(frame), np.array([model]), np.full((1, len(h)), walk), np.array([learns])
+        bank[None],
+        h[None],
+        dy,
+        np.float64(frame),
+        np.array([model]),
+        np.full((1, len(h)), walk),
+        np.array([learns]),
     )
     return made[0], take(found, 0)
 
@@ -77,9 +87,18 @@ def test_the_noise_of_the_last_frame_is_its_mean_given_all_motions():
 def test_one_update_by_hand_and_every_filter_on_its_own():
     """s = 1 + 4·2² + 1 = 18 with P_ee = σ² = 1, gain = 4·2/18, ν = 5 − 2 = 3; the other sees x = 0 and s = 2."""
     bank = fresh_bank(np.ones((2, 1, 1)), np.array([4.0]), 1.0)
-    args = np.array([[2.0], [0.0]]), np.array([5.0]), np.float64(1.0), np.zeros(2), np.zeros((2, 1)), np.array([True])
+    args = (
+        np.array([[2.0], [0.0]]),
+        np.array([5.0]),
+        np.float64(1.0),
+        np.zeros(2),
+        np.zeros((2, 1)),
+        np.array([True]),
+    )
     bank, found = learn(bank, *args)
-    np.testing.assert_allclose([found.square, found.variance, found.capped], [[9.0, 25.0], [18.0, 2.0], [18.0, 2.5]])
+    np.testing.assert_allclose(
+        [found.square, found.variance, found.capped], [[9.0, 25.0], [18.0, 2.0], [18.0, 2.5]]
+    )
     np.testing.assert_array_equal(found.frames, 2.0)
     np.testing.assert_allclose(bank[0], [[1.0 + 24.0 / 18.0, 3.0 / 18.0], [4.0 - 64.0 / 18.0, -8.0 / 18.0],
                                          [-8.0 / 18.0, 1.0 - 1.0 / 18.0]])  # fmt: skip
@@ -152,7 +171,9 @@ def quadratic(seed=3):
 
 
 def differences(feature, q, h=1e-5):
-    return np.stack([(feature(q + h * e) - feature(q - h * e)) / (2.0 * h) for e in np.eye(len(q))], axis=-1)
+    return np.stack(
+        [(feature(q + h * e) - feature(q - h * e)) / (2.0 * h) for e in np.eye(len(q))], axis=-1
+    )
 
 
 def test_a_feature_that_is_quadratic_in_the_joints_is_explained_exactly():
@@ -162,7 +183,9 @@ def test_a_feature_that_is_quadratic_in_the_joints_is_explained_exactly():
     for _ in range(5):
         q, step = rng.uniform(LOWER, UPPER), rng.normal(size=N)
         np.testing.assert_allclose(run.jacobian(q, NOMINAL), differences(feature, q), atol=1e-9)
-        explained = run.stage.explained(run.state, run.stage.regressors(q + step / 2, step, NOMINAL @ step))
+        explained = run.stage.explained(
+            run.state, run.stage.regressors(q + step / 2, step, NOMINAL @ step)
+        )
         np.testing.assert_allclose(explained, feature(q + step) - feature(q), atol=1e-12)
 
 
@@ -170,7 +193,9 @@ def regressors(middle, step, x):
     """Return [Δq, the products of r and Δq, x] with products as differences of r_j r_k, or of r_j²/2."""
     first, second = np.triu_indices(N)
     begin, end = (middle + sign * step / 2 - (LOWER + UPPER) / 2 for sign in (-1.0, 1.0))
-    products = (end[first] * end[second] - begin[first] * begin[second]) * np.where(first == second, 0.5, 1.0)
+    products = (end[first] * end[second] - begin[first] * begin[second]) * np.where(
+        first == second, 0.5, 1.0
+    )
     return np.concatenate([step, products, x])
 
 
@@ -182,12 +207,15 @@ def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypa
     H = np.array([regressors(*each[:3]) for each in run.seen])
     y = np.array([dy - x for *_, x, dy, _ in run.seen])
     lengths = np.linalg.norm(H[:, :N], axis=1)
-    walked = np.minimum.outer(np.cumsum(lengths), np.cumsum(lengths))  # what two motions share of the walk
+    # What two motions share of the walk
+    walked = np.minimum.outer(np.cumsum(lengths), np.cumsum(lengths))
     odds = -0.5 * stage.PRIOR
     for b, deviation in enumerate(stage.DEVIATIONS):
         prior = np.repeat([deviation, 1.0], (QUADRATIC, M)) ** 2
         walk = np.repeat([stage.WALK[b] * deviation, stage.MAP_WALK[b]], (QUADRATIC, M)) ** 2
-        S = moving_average(stage.REST_DRIFT**2 * PERIOD + (stage.MODEL_ERROR * lengths) ** 2, run.frame)
+        S = moving_average(
+            stage.REST_DRIFT**2 * PERIOD + (stage.MODEL_ERROR * lengths) ** 2, run.frame
+        )
         S += H * prior @ H.T + walked * (H * walk @ H.T)
         odds[b] += multivariate_normal(np.zeros(14), S).logpdf(y.T).sum()
     np.testing.assert_allclose(run.stage.weights(run.state), softmax(odds), rtol=1e-6)
@@ -198,7 +226,9 @@ def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypa
 def test_a_short_motion_changes_the_noise_of_the_frame_and_nothing_else():
     run = Walking(sigma=3e-3).follow(14, lambda q: NOMINAL @ q, NOMINAL)
     before = run.state
-    run.follow(1, lambda q: NOMINAL @ q, NOMINAL, size=1e-4, shift=np.array([[0.0] * M, [0.004] * M]))
+    run.follow(
+        1, lambda q: NOMINAL @ q, NOMINAL, size=1e-4, shift=np.array([[0.0] * M, [0.004] * M])
+    )
     np.testing.assert_array_equal(run.state.bank[:, :-1, :-1], before.bank[:, :-1, :-1])
     np.testing.assert_array_equal(run.stage.weights(run.state), run.stage.weights(before))
     assert (run.state.mean[:, -1] > before.mean[:, -1]).all()
@@ -240,18 +270,30 @@ def test_outliers_go_into_the_noise_of_their_frames_and_leave_the_model_alone(fr
     assert run.state.share > 0.95 > 0.7 > without.state.share
     run, without = jumping(outliers), jumping(np.zeros((frames, M)))
     error = np.linalg.norm(without.jacobian(UPPER, NOMINAL) - TURN @ NOMINAL)
-    assert np.linalg.norm(run.jacobian(UPPER, NOMINAL) - without.jacobian(UPPER, NOMINAL)) < error + 0.005
+    assert (
+        np.linalg.norm(run.jacobian(UPPER, NOMINAL) - without.jacobian(UPPER, NOMINAL))
+        < error + 0.005
+    )
     assert run.state.moves == without.state.moves == 0
 
 
 def test_three_frames_that_fit_only_one_another_are_a_moved_camera_and_three_outliers_are_not():
-    jump, apart = np.full((20, M), 0.3), 0.3 * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
+    jump, apart = (
+        np.full((20, M), 0.3),
+        0.3 * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]]),
+    )
     moved = jumping(jump, 43)
     assert moved.state.moves == 1
     W = jumping(jump, 42).state.bank[..., :M, :-1]
-    P0 = np.repeat(np.stack([stage.DEVIATIONS**2, np.ones_like(stage.DEVIATIONS)], axis=1), (QUADRATIC, M), axis=1)
+    P0 = np.repeat(
+        np.stack([stage.DEVIATIONS**2, np.ones_like(stage.DEVIATIONS)], axis=1),
+        (QUADRATIC, M),
+        axis=1,
+    )
     np.testing.assert_allclose(moved.state.bank[:, :M, :-1], W, atol=0.05)
-    np.testing.assert_array_equal(moved.state.bank[:, M:], [np.diag([*each, moved.frame]) for each in P0])
+    np.testing.assert_array_equal(
+        moved.state.bank[:, M:], [np.diag([*each, moved.frame]) for each in P0]
+    )
     assert (jumping(jump, 42).state.moves, jumping(jump).state.moves) == (0, 1)
     assert jumping(jump[:2]).state.moves == jumping(apart).state.moves == 0
 
@@ -260,7 +302,9 @@ def test_a_covariance_that_is_singular_is_a_named_fault():
     run = Walking()
     bank = run.state.bank.copy()
     near = len(stage.ROTATION_DEVIATIONS)
-    bank[:near, M + QUADRATIC : -1, QUADRATIC:-1] = -(stage.ROTATION_DEVIATIONS[:, None, None] ** 2) * np.eye(M)
+    bank[:near, M + QUADRATIC : -1, QUADRATIC:-1] = -(
+        stage.ROTATION_DEVIATIONS[:, None, None] ** 2
+    ) * np.eye(M)
     run.state = run.state._replace(bank=bank)
     with pytest.raises(FilterDiverged, match="covariance of the map is singular"):
         run.move(LOWER, np.full(N, 0.1), np.zeros(M), np.zeros(M))

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from kit.toy import Learning, motion
-from servobench.controllers.estimators.kalman import KalmanConfig, RlsConfig, RlsEstimator, kalman_estimator
+from servobench.controllers.estimators.kalman import (
+    KalmanConfig,
+    RlsConfig,
+    RlsEstimator,
+    kalman_estimator,
+)
 from servobench.controllers.estimators.robust_filter import (
     BISQUARE,
     MEMORY,
@@ -28,7 +33,9 @@ def frames(count, share, size=0.2, frames_each=1, seed=0):
     dq = rng.normal(scale=0.02, size=(count, N))
     y = np.cumsum(dq @ J.T, axis=0) + NOISE * rng.normal(size=(count, M))
     wrong = np.repeat(rng.random(count // frames_each + 1) < share, frames_each)[:count]
-    directions = np.repeat(rng.normal(size=(count // frames_each + 1, M)), frames_each, axis=0)[:count]
+    directions = np.repeat(rng.normal(size=(count // frames_each + 1, M)), frames_each, axis=0)[
+        :count
+    ]
     y += wrong[:, None] * size * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     return J, dq, y
 
@@ -70,12 +77,16 @@ def test_a_filter_without_weights_is_the_kalman_filter_of_feature_and_jacobian()
         np.testing.assert_allclose(run.state.deviation, y[k] - x[:, 0], atol=1e-10)
         np.testing.assert_allclose(run.state.P, P, atol=1e-10)
     of_jacobian = np.mean([np.diagonal(each)[1:] for each in P])
-    np.testing.assert_allclose(run.diagnostics()["jacobian_deviation"], np.sqrt(of_jacobian), rtol=1e-6)
+    np.testing.assert_allclose(
+        run.diagnostics()["jacobian_deviation"], np.sqrt(of_jacobian), rtol=1e-6
+    )
 
 
 def test_the_weight_is_that_of_tukey_and_belongs_to_the_residual():
     u = np.array([0.0, 1.0, BISQUARE / np.sqrt(2.0), BISQUARE, 100.0])
-    np.testing.assert_allclose(bisquare_weight(u), [1.0, (1.0 - 1.0 / BISQUARE**2) ** 2, 0.25, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(
+        bisquare_weight(u), [1.0, (1.0 - 1.0 / BISQUARE**2) ** 2, 0.25, 0.0, 0.0], atol=1e-15
+    )
     innovation, variance, noise = np.array([0.002]), np.array([1e-6]), np.array([4e-6])
     w = irls_weight(innovation, variance, noise)
     residual = innovation * noise / (w * variance + noise)
@@ -129,7 +140,10 @@ def test_in_the_loop_its_jacobian_bears_40_percent_outlier_frames():
             "kinematic": {"sensing": {"outlier_size": 0.2}},
             name: {"law": {"proportional_gain": 1.0, "damping": 0.02}},
         }
-        requests = [RunRequest("kinematic", name, "random", "moderate+outliers=40%", seed) for seed in range(6)]
+        requests = [
+            RunRequest("kinematic", name, "random", "moderate+outliers=40%", seed)
+            for seed in range(6)
+        ]
         results = carry_out_together([resolve(request, Settings(sections)) for request in requests])
         return np.array([result.row["jacobian_error_mean"] for result in results])
 

@@ -107,7 +107,9 @@ class Wishing(Law):
 def test_the_law_gets_the_feature_and_the_reference_of_when_commands_are_carried_out():
     """A given delay of one period: all of the last step is still to come, and takes that period."""
     controller = servo(
-        ConstantEstimator(), Wishing(), {"response": "given", "command_delay": 0.05, "lag": 0.0, "feedforward": True}
+        ConstantEstimator(),
+        Wishing(),
+        {"response": "given", "command_delay": 0.05, "lag": 0.0, "feedforward": True},
     )
     reference = np.array([[0.0, 0.0], [0.3, 0.2]])
     controller.reset(seen(np.zeros(3), [0.1, 0.0]), 0)
@@ -118,16 +120,23 @@ def test_the_law_gets_the_feature_and_the_reference_of_when_commands_are_carried
     np.testing.assert_array_equal(first.feature, [0.1, 0.0])
     np.testing.assert_allclose(look.joint_position, sent * 0.05)
     np.testing.assert_allclose(look.feature, [0.1, 0.0] + J0 @ sent * 0.05)
-    np.testing.assert_allclose(rows, [[0.3, 0.2], [0.6, 0.4]])  # one period later, and beyond the preview
+    # One period later, and beyond the preview
+    np.testing.assert_allclose(rows, [[0.3, 0.2], [0.6, 0.4]])
     assert controller.diagnostics()["lead"] == pytest.approx(0.05)
 
 
 def test_the_last_stages_change_what_is_sent_and_the_law_notes_it():
     aids = {"feedforward": True, "limit": "clip"}
-    controller, reference = servo(ConstantEstimator(), Wishing(), aids), np.array([[0.0, 0.0], [0.02, 0.01]])
+    controller, reference = (
+        servo(ConstantEstimator(), Wishing(), aids),
+        np.array([[0.0, 0.0], [0.02, 0.01]]),
+    )
     controller.reset(seen(np.zeros(3), np.zeros(2)), 0)
     u = controller.step(seen(np.zeros(3), np.zeros(2)), reference).joint_velocity
-    wanted = np.array([0.4, -0.2, 0.1]) + J0.T @ np.linalg.solve(J0 @ J0.T + 0.02**2 * np.eye(2), reference[1]) / 0.05
+    wanted = (
+        np.array([0.4, -0.2, 0.1])
+        + J0.T @ np.linalg.solve(J0 @ J0.T + 0.02**2 * np.eye(2), reference[1]) / 0.05
+    )
     assert np.abs(wanted).max() > 1.0
     np.testing.assert_allclose(u, np.clip(wanted, -1.0, 1.0))
     noted, limited = controller.state.law[-1]
@@ -144,7 +153,11 @@ def test_a_law_of_the_model_works_in_the_frame_of_the_model():
 
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     for law, frame in ((Trained(), np.eye(2)), (Wishing(), turn)):
-        controller, rng, q = servo(ConstantEstimator(), law, {"model": "regression"}), np.random.default_rng(0), 0.0
+        controller, rng, q = (
+            servo(ConstantEstimator(), law, {"model": "regression"}),
+            np.random.default_rng(0),
+            0.0,
+        )
         for k in range(40):
             q = q + 0.05 * rng.normal(size=3)
             y = turn @ J0 @ q
@@ -188,15 +201,37 @@ PREVIEWING = MpcLaw(MpcConfig(horizon_time=0.05, moves=1), KNOWLEDGE)
 @pytest.mark.parametrize(
     ("law", "aids", "message"),
     [
-        (PREDICTIVE, {"delay": "identified"}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
-        (PREDICTIVE, {"response": "given"}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
-        (PREDICTIVE, {"filter": True}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
-        (PREVIEWING, {"feedforward": True}, "aids.feedforward: MpcLaw brings its own preview; leave this aid out"),
-        (PREVIEWING, {"limit": "clip"}, "aids.limit: MpcLaw brings its own limit; leave this aid out"),
+        (
+            PREDICTIVE,
+            {"delay": "identified"},
+            "aids: MpcLaw predicts by itself; leave delay, response and filter off",
+        ),
+        (
+            PREDICTIVE,
+            {"response": "given"},
+            "aids: MpcLaw predicts by itself; leave delay, response and filter off",
+        ),
+        (
+            PREDICTIVE,
+            {"filter": True},
+            "aids: MpcLaw predicts by itself; leave delay, response and filter off",
+        ),
+        (
+            PREVIEWING,
+            {"feedforward": True},
+            "aids.feedforward: MpcLaw brings its own preview; leave this aid out",
+        ),
+        (
+            PREVIEWING,
+            {"limit": "clip"},
+            "aids.limit: MpcLaw brings its own limit; leave this aid out",
+        ),
         (None, {"feedforward": True}, "preview must be at least 1 for feedforward, got 0"),
     ],
 )
-def test_an_aid_that_the_law_brings_or_that_lacks_a_preview_is_refused_in_one_line(law, aids, message):
+def test_an_aid_that_the_law_brings_or_that_lacks_a_preview_is_refused_in_one_line(
+    law, aids, message
+):
     knowledge = KNOWLEDGE if law else dataclasses.replace(KNOWLEDGE, preview=0)
     with pytest.raises(ValueError, match=f"^{message}$"):
         servo(ConstantEstimator(), law, aids, knowledge)

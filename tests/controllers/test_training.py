@@ -9,8 +9,17 @@ from kit.toy import PERIOD, planar_jacobian, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.mpc.mpc import MpcConfig
 from servobench.controllers.methods import METHODS
-from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
-from servobench.controllers.networks.file import FORMAT, TrainedNetworks, load_networks, save_networks
+from servobench.controllers.networks.config import (
+    ControllerTraining,
+    JacobianTraining,
+    TrainingConfig,
+)
+from servobench.controllers.networks.file import (
+    FORMAT,
+    TrainedNetworks,
+    load_networks,
+    save_networks,
+)
 from servobench.controllers.networks.fit import (
     choose_centres,
     controller_dimension,
@@ -84,7 +93,9 @@ def test_samples_of_the_controller_follow_from_the_model():
     np.testing.assert_allclose(e_old - e, np.einsum("smn,sn->sm", J, q - q_old), atol=1e-12)
     assert (np.abs(q - q_old) <= SPEC.joint_velocity_limit * PERIOD).all()
     assert (np.abs(e) <= plan.error_range).all()
-    np.testing.assert_allclose(np.einsum("smn,sn->sm", J, samples.command - q), 0.15 * e, atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("smn,sn->sm", J, samples.command - q), 0.15 * e, atol=1e-12
+    )
     np.testing.assert_allclose(np.einsum("smn,sn->sm", J, samples.posture_step), 0.0, atol=1e-12)
     assert (np.einsum("sn,sn->s", samples.posture_step, 1.0 - q) >= -1e-12).all()
     ideal = ideal_controller_matrix(samples.gain, 2, 2)
@@ -96,11 +107,16 @@ def test_the_damped_law_moves_in_weak_directions_which_the_truncated_one_leaves_
     def weak(q):
         return planar_jacobian(q) * np.array([[1.0], [0.01]])
 
-    unit, share = unit_points(50, controller_dimension(CONFIG, SPEC), np.random.default_rng(0)), 3.0 * CONTROLLER.step
+    unit, share = (
+        unit_points(50, controller_dimension(CONFIG, SPEC), np.random.default_rng(0)),
+        3.0 * CONTROLLER.step,
+    )
     plan = dataclasses.replace(CONFIG, controller=dataclasses.replace(CONTROLLER, damping=0.001))
     printed, damped = (controller_samples(unit, config, SPEC, weak) for config in (CONFIG, plan))
     J, gain = weak(damped.position), damped.gain
-    np.testing.assert_allclose(gain, share * np.linalg.solve(J.mT @ J + 1e-6 * np.eye(N), J.mT), rtol=1e-6)
+    np.testing.assert_allclose(
+        gain, share * np.linalg.solve(J.mT @ J + 1e-6 * np.eye(N), J.mT), rtol=1e-6
+    )
     assert np.abs((J @ printed.gain)[:, 1, 1]).max() < 0.01 * share
     assert np.median((J @ gain)[:, 1, 1]) > 0.9 * share
 
@@ -118,7 +134,9 @@ def test_ridge_solutions_equal_least_squares_on_augmented_rows():
 @pytest.mark.parametrize("placement", ["halton", "sobol", "kmeans"])
 def test_centres_lie_in_the_region_wherever_they_come_from(placement):
     rng = np.random.default_rng(0)
-    centres = choose_centres(unit_points(pool_size(9, placement), 4, rng, placement), 9, rng, placement)
+    centres = choose_centres(
+        unit_points(pool_size(9, placement), 4, rng, placement), 9, rng, placement
+    )
     assert centres.shape == (9, 4)
     assert ((centres >= 0.0) & (centres <= 1.0)).all()
     assert len(np.unique(centres.round(9), axis=0)) == 9
@@ -126,7 +144,12 @@ def test_centres_lie_in_the_region_wherever_they_come_from(placement):
 
 @pytest.mark.parametrize(
     "change",
-    [{"fit": "entries"}, {"kernel": "gaussian"}, {"placement": "kmeans"}, {"error_history": 2, "position_history": 2}],
+    [
+        {"fit": "entries"},
+        {"kernel": "gaussian"},
+        {"placement": "kmeans"},
+        {"error_history": 2, "position_history": 2},
+    ],
     ids=str,
 )
 def test_every_choice_of_the_controller_s_fit_trains(change):
@@ -169,7 +192,9 @@ def test_one_training_serves_all_control_rates(networks):
 
 def test_the_step_scales_the_gains_that_are_imitated():
     unit = np.random.default_rng(0).random((20, controller_dimension(CONFIG, SPEC)))
-    one, two = (controller_samples(unit, of_step(step), SPEC, planar_jacobian) for step in (0.05, 0.1))
+    one, two = (
+        controller_samples(unit, of_step(step), SPEC, planar_jacobian) for step in (0.05, 0.1)
+    )
     np.testing.assert_allclose(two.gain, 2.0 * one.gain, rtol=1e-12)
     np.testing.assert_allclose(two.posture_step, 2.0 * one.posture_step, rtol=1e-12)
     assert train(of_step(0.1), planar_jacobian, SPEC).controller.step == 0.1
@@ -240,7 +265,9 @@ def test_corrupt_and_foreign_files_are_refused_in_one_line(tmp_path, networks):
         load_networks(path)
 
 
-def test_files_of_another_version_robot_or_configuration_and_missing_ones_are_refused(tmp_path, networks):
+def test_files_of_another_version_robot_or_configuration_and_missing_ones_are_refused(
+    tmp_path, networks
+):
     path = tmp_path / "networks.npz"
     save_networks(networks, path)
     with pytest.raises(ValueError, match=r"training digest \w+, wanted 00"):
@@ -274,7 +301,9 @@ def test_all_presets_take_their_networks_from_the_harness(networks):
 def test_networks_of_another_robot_are_refused_at_construction(networks):
     told = knowledge(spec=plant_spec(6, 3), train=lambda config: networks)
     for entry in TRAINED:
-        with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
+        with pytest.raises(
+            ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"
+        ):
             entry.build(entry.config(), told)
 
 
@@ -290,7 +319,9 @@ def test_a_jacobian_that_the_network_can_represent_is_fitted_to_the_last_digits(
     plan = dataclasses.replace(JACOBIAN, centres=8, width_scales=(1.0,), regularisations=(1e-14,))
     config = dataclasses.replace(CONFIG, jacobian=plan)
     shape = train(config, planar_jacobian, SPEC).jacobian
-    true = JacobianNetwork(shape.centres, shape.widths, np.random.default_rng(3).normal(size=shape.weights.shape))
+    true = JacobianNetwork(
+        shape.centres, shape.widths, np.random.default_rng(3).normal(size=shape.weights.shape)
+    )
     fitted = train(config, true.jacobian, SPEC)
     assert fitted.jacobian_error < 1e-6
     q = np.full(N, 1.1)
@@ -300,20 +331,41 @@ def test_a_jacobian_that_the_network_can_represent_is_fitted_to_the_last_digits(
 EMPTY = dataclasses.replace(CONFIG, lower=(), upper=())
 REFUSED = [
     (lambda: MpcConfig(view_tangent=(0.5,)), r"empty or \(horizontal, vertical\), got \(0.5,\)"),
-    (lambda: ControllerTraining(samples=59), "samples must be at least the 60 hidden units, got 59"),
-    (lambda: JacobianTraining(centres=60, samples=59), "samples must be at least the 60 centres, got 59"),
-    (lambda: TrainingConfig((0.0,), (1.0, 1.0)), "lower and upper must be equally long, got 1 and 2"),
+    (
+        lambda: ControllerTraining(samples=59),
+        "samples must be at least the 60 hidden units, got 59",
+    ),
+    (
+        lambda: JacobianTraining(centres=60, samples=59),
+        "samples must be at least the 60 centres, got 59",
+    ),
+    (
+        lambda: TrainingConfig((0.0,), (1.0, 1.0)),
+        "lower and upper must be equally long, got 1 and 2",
+    ),
     (lambda: TrainingConfig((1.0,), (1.0,)), "lower must be below upper"),
     (lambda: ControllerTraining(hidden=1), "hidden must be at least 2, got 1"),
-    (lambda: TrainingConfig(held_out=0.9999), r"held_out leaves none of 4000 samples for the fit, got 0\.9999"),
+    (
+        lambda: TrainingConfig(held_out=0.9999),
+        r"held_out leaves none of 4000 samples for the fit, got 0\.9999",
+    ),
     (
         lambda: train(TrainingConfig((0.0,) * 2, (1.0,) * 2), planar_jacobian, SPEC),
         "lower and upper must name 3 joints, got 2",
     ),
-    (lambda: train(CONFIG, lambda q: planar_jacobian(q)[..., :2], SPEC), "nominal_jacobian must return"),
-    (lambda: train(CONFIG, lambda q: planar_jacobian(q) * np.nan, SPEC), "nominal_jacobian must be finite"),
+    (
+        lambda: train(CONFIG, lambda q: planar_jacobian(q)[..., :2], SPEC),
+        "nominal_jacobian must return",
+    ),
+    (
+        lambda: train(CONFIG, lambda q: planar_jacobian(q) * np.nan, SPEC),
+        "nominal_jacobian must be finite",
+    ),
     (lambda: obtain_networks(EMPTY, knowledge(region=None)), "training needs a region"),
-    (lambda: obtain_networks(CONFIG, knowledge(nominal_jacobian=None)), "training needs a nominal model"),
+    (
+        lambda: obtain_networks(CONFIG, knowledge(nominal_jacobian=None)),
+        "training needs a nominal model",
+    ),
 ]
 
 

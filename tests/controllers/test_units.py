@@ -27,7 +27,9 @@ def test_everything_about_features_is_divided_by_their_scale():
             true_symbolic=lambda q: 48.0 * q,
         )
     )
-    np.testing.assert_array_equal(natural.nominal_jacobian(np.zeros((3, 2)))[2], [[10.0, 0.0], [2.0, 0.5]])
+    np.testing.assert_array_equal(
+        natural.nominal_jacobian(np.zeros((3, 2)))[2], [[10.0, 0.0], [2.0, 0.5]]
+    )
     np.testing.assert_array_equal(natural.true_jacobian(np.zeros(2)), [[20.0, 0.0], [4.0, 1.0]])
     assert natural.true_symbolic(2.0) == 6.0
     assert natural.unit == 16.0

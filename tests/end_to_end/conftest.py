@@ -35,7 +35,9 @@ def open_scene(engine):
     scenes = []
 
     def build(**options):
-        scenes.append(load_engine(engine).scene(Room(rendered.MODEL.arm, robot=rendered.UR5, **options)))
+        scenes.append(
+            load_engine(engine).scene(Room(rendered.MODEL.arm, robot=rendered.UR5, **options))
+        )
         return scenes[-1]
 
     yield build

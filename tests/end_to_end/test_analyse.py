@@ -19,12 +19,25 @@ def test_loops_are_analysed_side_by_side(output_of, tmp_path):
     assert figures == ["loops.pdf", "loops.png", "stability_map.pdf", "stability_map.png"]
 
 
-def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(output_of, monkeypatch, tmp_path):
-    monkeypatch.setattr("servobench.harness.pictures.loops.write_pictures", lambda folder, *_: [folder])
+def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(
+    output_of, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(
+        "servobench.harness.pictures.loops.write_pictures", lambda folder, *_: [folder]
+    )
     margins = []
     for robot, how in (("ur5", ("--jacobian", "nominal")), ("panda", ("--identify",))):
         identified = "--identify" in how
-        asked = ["pid+constant", "--mismatch", "moderate", "--robot", robot, "--out", str(tmp_path / robot), *how]
+        asked = [
+            "pid+constant",
+            "--mismatch",
+            "moderate",
+            "--robot",
+            robot,
+            "--out",
+            str(tmp_path / robot),
+            *how,
+        ]
         assert ("identified in small motions" in output_of("analyse", *asked)) == identified
         table = pd.read_csv(tmp_path / robot / "analyse.csv")
         assert table["model"].tolist() == ["identified" if identified else "linearised"]
@@ -33,7 +46,11 @@ def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(output_of, mo
 
 
 def test_the_title_names_loops_that_are_identified(output_of, monkeypatch, tmp_path):
-    monkeypatch.setattr("servobench.harness.pictures.loops.write_pictures", lambda folder, *_: [folder])
+    monkeypatch.setattr(
+        "servobench.harness.pictures.loops.write_pictures", lambda folder, *_: [folder]
+    )
     own = "docs/examples/own_controller.py:ResolvedRate"
     printed = output_of("analyse", "pid+true", own, "--out", str(tmp_path))
-    assert "the true Jacobian; identified in small motions: ResolvedRate" in " ".join(printed.split())
+    assert "the true Jacobian; identified in small motions: ResolvedRate" in " ".join(
+        printed.split()
+    )

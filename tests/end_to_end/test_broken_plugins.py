@@ -63,7 +63,11 @@ class Falls(Mine):
         ctypes.string_at(0)
 """
 ).replace("import numpy", "import ctypes\nimport os\n\nimport numpy")
-MODULES = {"crash": "1 / 0\n", "end": "import os\n\nos._exit(0)\n", "wait": "import time\n\ntime.sleep(1000)\n"}
+MODULES = {
+    "crash": "1 / 0\n",
+    "end": "import os\n\nos._exit(0)\n",
+    "wait": "import time\n\ntime.sleep(1000)\n",
+}
 CELLS = (
     CELL
     + """
@@ -118,7 +122,8 @@ UNUSED = {
     "all": "controller 'all' (some_law:Mine) is not used: the command line has another meaning for this name",
 }
 UNUSED_PLANT = (
-    "plant 'bullet' (some_cell:Cell) is not used: servobench has a plant of this name, which cannot be taken over"
+    "plant 'bullet' (some_cell:Cell) is not used: "
+    "servobench has a plant of this name, which cannot be taken over"
 )
 DRIVER = """
 import contextlib, io, json, sys
@@ -181,14 +186,21 @@ def test_the_list_marks_each_and_shows_the_others(told):
     assert {name: error for name, error in listed if error and name in CONTROLLERS} == CONTROLLERS
     others = [error for _, error in listed if error and error not in CONTROLLERS.values()]
     assert others == [*HARMFUL.values(), *UNUSED.values()]
-    assert [name for name, error in listed if error is None] == ["ukf_mfac", "constant", "nmpc_calibrated", "whole"]
+    assert [name for name, error in listed if error is None] == [
+        "ukf_mfac",
+        "constant",
+        "nmpc_calibrated",
+        "whole",
+    ]
 
 
 def test_the_list_of_plants_marks_each_and_shows_the_others(told):
     code, out, _ = told["plants"]
     listed = [(each["name"], each.get("error")) for each in json.loads(out)]
     # An engine may be missing here, which is another error.
-    errors = [error for name, error in listed if error and (name not in RENDERED or error == UNUSED_PLANT)]
+    errors = [
+        error for name, error in listed if error and (name not in RENDERED or error == UNUSED_PLANT)
+    ]
     assert code == 0
     assert errors[0] == PLANTS["crashing"]
     assert errors[1] == PLANTS["ending"]
@@ -200,7 +212,9 @@ def test_the_list_of_plants_marks_each_and_shows_the_others(told):
 def test_all_others_are_compared_and_each_broken_one_is_a_line(told):
     code, out, errors = told["compare"]
     assert code == 0, errors
-    left_out = [f"servobench: left out: {line}" for line in [*CONTROLLERS.values(), *HARMFUL.values()]]
+    left_out = [
+        f"servobench: left out: {line}" for line in [*CONTROLLERS.values(), *HARMFUL.values()]
+    ]
     notes = [f"servobench: note: {line}" for line in UNUSED.values()]
     lines = [line for line in errors.splitlines() if line.startswith("servobench: ")]
     assert sorted(lines) == sorted(left_out + notes)

@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
+pybullet = pytest.importorskip(
+    "pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
+)
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL, UR5
 from servobench.plant.bench.plant import PlantSetup
@@ -52,14 +54,23 @@ def test_closing_disconnects_and_may_be_repeated():
 
 
 def test_motion_under_torques_is_that_of_pybullets_own_engine():
-    drives, stops, h, q = DriveConfig(payload=1.0, assumed_payload=0.0), np.full(6, np.pi), PHYSICS_STEP, HOME
+    drives, stops, h, q = (
+        DriveConfig(payload=1.0, assumed_payload=0.0),
+        np.full(6, np.pi),
+        PHYSICS_STEP,
+        HOME,
+    )
     mechanics = BulletSimulation(Machine(MODEL.arm, UR5, (), drives, 0.0, HOME, (-stops, stops)))
     client, arm, joints, v = mechanics._world.client, mechanics._arm, list(range(6)), np.zeros(6)
     torque, body = np.array([5.0, -8.0, 10.0, 2.0, 0.5, 0.0]), mechanics.body(HOME, v)
     pybullet.setPhysicsEngineParameter(fixedTimeStep=h, physicsClientId=client)
-    pybullet.setJointMotorControlArray(arm, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=client)
+    pybullet.setJointMotorControlArray(
+        arm, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=client
+    )
     for joint in range(-1, 8):
-        pybullet.changeDynamics(arm, joint, linearDamping=0.0, angularDamping=0.0, physicsClientId=client)
+        pybullet.changeDynamics(
+            arm, joint, linearDamping=0.0, angularDamping=0.0, physicsClientId=client
+        )
         pybullet.setCollisionFilterGroupMask(arm, joint, 0, 0, physicsClientId=client)
     for joint, angle in enumerate(HOME):
         pybullet.changeDynamics(arm, joint, jointDamping=0.0, physicsClientId=client)
@@ -73,7 +84,9 @@ def test_motion_under_torques_is_that_of_pybullets_own_engine():
             arm, joints, pybullet.TORQUE_CONTROL, forces=torque.tolist(), physicsClientId=client
         )
         pybullet.stepSimulation(physicsClientId=client)
-    simulated = np.array([state[0] for state in pybullet.getJointStates(arm, joints, physicsClientId=client)])
+    simulated = np.array(
+        [state[0] for state in pybullet.getJointStates(arm, joints, physicsClientId=client)]
+    )
     mechanics.close()
     assert np.abs(q - HOME).max() > 0.01
     np.testing.assert_allclose(q, simulated, atol=1e-3 * np.abs(q - HOME).max())
@@ -93,13 +106,21 @@ def test_a_pybullet_without_numpy_works_too(open_plant, monkeypatch):
 
     def tuples(*args, **options):
         width, height, rgba, depth, labels = original(*args, **options)
-        return width, height, tuple(np.ravel(rgba).tolist()), tuple(np.ravel(depth).tolist()), labels
+        return (
+            width,
+            height,
+            tuple(np.ravel(rgba).tolist()),
+            tuple(np.ravel(depth).tolist()),
+            labels,
+        )
 
     monkeypatch.setattr(pybullet, "getCameraImage", tuples)
     np.testing.assert_allclose(plant.reset(0).feature, expected.feature, atol=1e-9)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X11 names its display in the environment")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="only X11 names its display in the environment"
+)
 def test_a_window_without_a_display_is_refused(open_plant, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ValueError, match="view needs a display"):

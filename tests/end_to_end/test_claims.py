@@ -29,7 +29,13 @@ from servobench.harness.studies.claims import (
     answer_all,
     studies,
 )
-from servobench.harness.studies.reproduction import differences, elsewhere, markdown_table, read_answers, write_tables
+from servobench.harness.studies.reproduction import (
+    differences,
+    elsewhere,
+    markdown_table,
+    read_answers,
+    write_tables,
+)
 from servobench.plant.contract.faults import ConfigurationError
 
 METHODS = (PROPOSED, "rbf_pid", "ukf_mfac", "ukf_mpc")
@@ -52,7 +58,10 @@ def table(seed: int, **changes) -> pd.DataFrame:
                     "settling_time_s": 2.0, "overshoot": 0.1, "path_length_ratio": 1.1, "jacobian_error_mean": 0.1,
                     "rms_error_evaluated": 0.02, "controller_time_median_us": 100.0,
                 }  # fmt: skip
-                row = {name: value * (1.0 + 1e-3 * generator.standard_normal()) for name, value in row.items()}
+                row = {
+                    name: value * (1.0 + 1e-3 * generator.standard_normal())
+                    for name, value in row.items()
+                }
                 for name, change in changes.items():
                     row[name] += change(controller, task)
                 rows.append(
@@ -82,7 +91,8 @@ def verdicts(made: dict[str, pd.DataFrame]) -> dict[str, str]:
 def late(mpc=0.0, tasks=MOVES, **leaving):
     """Settling times: `ukf_mpc` is later in some moves, others in the moves that leave the training region."""
     return lambda controller, task: (
-        mpc * (controller == "ukf_mpc") * (task in tasks) + leaving.get(controller, 0.0) * (task in ("exp1", "exp4"))
+        mpc * (controller == "ukf_mpc") * (task in tasks)
+        + leaving.get(controller, 0.0) * (task in ("exp1", "exp4"))
     )
 
 
@@ -125,7 +135,9 @@ def test_runs_that_never_settle_or_fail_count_as_slow():
     made = tables(settling_time_s=proposed(-0.5))
     runs = made[MAIN]
     mine = runs["controller"] == PROPOSED
-    made[MAIN] = runs.assign(settling_time_s=runs["settling_time_s"].mask(mine & (runs["task"] == "exp1")))
+    made[MAIN] = runs.assign(
+        settling_time_s=runs["settling_time_s"].mask(mine & (runs["task"] == "exp1"))
+    )
     made[MAIN].loc[mine & (runs["task"] == "exp2"), "status"] = "feature_lost"
     assert verdicts(made)["1"] == f"{DEPENDS}: holds in 6 of 12"
 
@@ -150,7 +162,10 @@ def test_the_medians_of_circles_come_with_the_number_of_lost_ones():
 def test_times_that_are_equal_but_for_rounding_do_not_differ():
     """The binary numbers next to 0.1 + 0.2 and 0.3 differ; the sign of such a rest decided claim 4 once."""
     made = tables()
-    leaving, first = made[MAIN]["task"].isin(("exp1", "exp4")), made[MAIN]["controller"].isin((PROPOSED, "rbf_pid"))
+    leaving, first = (
+        made[MAIN]["task"].isin(("exp1", "exp4")),
+        made[MAIN]["controller"].isin((PROPOSED, "rbf_pid")),
+    )
     times = np.where(leaving, np.where(first, 0.1 + 0.2, 0.3), 0.0)
     made[MAIN] = made[MAIN].assign(settling_time_s=times)
     assert times.max() > 0.3
@@ -174,11 +189,15 @@ def test_robots_too_few_for_a_rule_decide_nothing(claim, changes, verdict):
 def test_where_no_run_reached_its_last_period_nothing_is_answered():
     made = tables()
     made[TIMED] = made[TIMED].assign(status="crashed").drop(columns="settling_time_s")
-    with pytest.raises(ConfigurationError, match=f"no run of {TIMED} on kinematic reached its last period"):
+    with pytest.raises(
+        ConfigurationError, match=f"no run of {TIMED} on kinematic reached its last period"
+    ):
         answer_all(made, "kinematic")
 
 
-@pytest.mark.parametrize(("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)])
+@pytest.mark.parametrize(
+    ("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)]
+)
 def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, number, same):
     answer = answer_all(tables(), "kinematic")[0]
     write_tables([replace(answer, evidence="circle 10.0 [9.0, 12.5] mm in 38 of 40")], tmp_path)
@@ -200,12 +219,16 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
     assert differences(answers, wanted) == []
     (line,) = differences([replace(answers[0], verdict=REPRODUCED), *answers[1:]], wanted)
     assert line.startswith("claim 1 on kinematic, best equipped: now reproduced: faster in")
-    (line,) = differences([replace(answers[0], evidence=answers[0].evidence.replace("faster", "slower"))], wanted)
+    (line,) = differences(
+        [replace(answers[0], evidence=answers[0].evidence.replace("faster", "slower"))], wanted
+    )
     assert "slower" in line
     assert differences([replace(answers[0], plant="bullet")], wanted) == [
         "claim 1 on bullet, best equipped: not in the table"
     ]
-    with pytest.raises(ConfigurationError, match=r"measurements.csv is not a table of answers: wanted .*verdict"):
+    with pytest.raises(
+        ConfigurationError, match=r"measurements.csv is not a table of answers: wanted .*verdict"
+    ):
         read_answers(tmp_path / "measurements.csv")
 
 
@@ -213,7 +236,11 @@ def test_an_answer_that_is_another_on_a_second_engine_is_marked():
     first = replace(answer_all(tables(), "kinematic")[0], plant="bullet", verdict=REPRODUCED)
     second = replace(first, plant="mujoco", verdict="depends: holds in 2 of 4")
     answers = [first, second, replace(second, division="as published")]
-    assert [elsewhere(a, answers) for a in answers] == [" (otherwise on mujoco)", " (otherwise on bullet)", ""]
+    assert [elsewhere(a, answers) for a in answers] == [
+        " (otherwise on mujoco)",
+        " (otherwise on bullet)",
+        "",
+    ]
     assert "**reproduced** (otherwise on mujoco)" in markdown_table(answers)
     as_often = replace(first, verdict="depends: holds in 3 of 4")
     assert elsewhere(as_often, [as_often, second]) == ""
@@ -240,7 +267,17 @@ def test_the_methods_as_published_are_answered_for_under_their_plain_names():
 def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(refusal_of, tmp_path):
     made = studies(["kinematic"], 6, "best equipped", "lab")
     assert all("-lab-" in cell.request.run_id for study in made.values() for cell in study.cells)
-    wrong = ("claims", "--plants", "kinematic", "--seeds", "6", "--mismatch", "labs", "--out", str(tmp_path / "out"))
+    wrong = (
+        "claims",
+        "--plants",
+        "kinematic",
+        "--seeds",
+        "6",
+        "--mismatch",
+        "labs",
+        "--out",
+        str(tmp_path / "out"),
+    )
     assert "lab" in refusal_of(*wrong)
     assert not (tmp_path / "out").exists()
 
@@ -274,15 +311,32 @@ def brief_studies(*arguments):
     }
 
 
-def test_the_command_answers_from_real_runs_and_says_the_same_again(output_of, monkeypatch, tmp_path):
+def test_the_command_answers_from_real_runs_and_says_the_same_again(
+    output_of, monkeypatch, tmp_path
+):
     monkeypatch.setattr(claims, "TIMED_ROBOTS", 1)
     monkeypatch.setattr(reproduction, "studies", brief_studies)
-    monkeypatch.setattr(reproduction, "save_figure", partial(reproduction.save_figure, formats=["png"]))
-    short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1", "--division", "equipped")
+    monkeypatch.setattr(
+        reproduction, "save_figure", partial(reproduction.save_figure, formats=["png"])
+    )
+    short = (
+        "claims",
+        "--plants",
+        "kinematic",
+        "--seeds",
+        "6",
+        "--workers",
+        "1",
+        "--division",
+        "equipped",
+    )
     shown = output_of(*short, "--out", tmp_path / "first")
     assert "1: converges faster than the other three on kinematic, best equipped" in shown
     files = list((tmp_path / "first" / "figures").glob("*.png"))
-    assert {file.stem for file in files} == {*(f"claim_{k}" for k in range(1, 8)), *reproduction.READINGS.values()}
+    assert {file.stem for file in files} == {
+        *(f"claim_{k}" for k in range(1, 8)),
+        *reproduction.READINGS.values(),
+    }
     assert all(file.stat().st_size > 5_000 for file in files)
     monkeypatch.setattr(reproduction, "draw_answers", lambda *_: None)
     wanted = tmp_path / "wanted.csv"

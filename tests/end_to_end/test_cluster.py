@@ -17,7 +17,9 @@ from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.processes import Bounds
 from servobench.plant.contract.faults import ConfigurationError
 
-pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="the extra 'cluster' is not installed")
+pytestmark = pytest.mark.skipif(
+    find_spec("distributed") is None, reason="the extra 'cluster' is not installed"
+)
 
 SEEDS = ("--seeds", "30", "--set", "random.duration=3")
 RUNS = 120  # the first block is there long before the last
@@ -39,10 +41,21 @@ def cluster(tmp_path):
             )  # fmt: skip
 
     def address():
-        return re.search(r"Scheduler at:\s+(tcp://127.0.0.1:\d+)", (folder / "scheduler.log").read_text())
+        return re.search(
+            r"Scheduler at:\s+(tcp://127.0.0.1:\d+)", (folder / "scheduler.log").read_text()
+        )
 
     try:
-        launch("scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", ":0")
+        launch(
+            "scheduler",
+            "scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--dashboard-address",
+            ":0",
+        )
         wait_for(lambda: address() is not None)
         for name in ("first", "second"):
             launch(name, "worker", address()[1], "--nthreads", "1", "--no-dashboard")
@@ -58,7 +71,10 @@ def test_a_cluster_runs_what_is_in_files_and_a_worker_that_is_killed_in_mid_swee
     cluster, tmp_path, monkeypatch
 ):
     scheduler, workers = cluster
-    cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/sent.py")
+    cell, mine = (
+        write(tmp_path, CONFIGURED_CELL, "a/cell.py"),
+        write(tmp_path, CONFIGURED, "b/sent.py"),
+    )
     named = ("--plants", f"{cell}:Cell,kinematic", "--controllers", f"{mine},broyden")
     asked = ("sweep", *named, *SEEDS, "--set", "Mine.gain=3", "--set", "Cell.speed=0.5", "--out")
     remote = start(*asked, str(tmp_path / "remote"), "--scheduler", scheduler)
@@ -67,7 +83,10 @@ def test_a_cluster_runs_what_is_in_files_and_a_worker_that_is_killed_in_mid_swee
     finished_before = len(results.load_runs(tmp_path / "remote"))
     code, output = finish(remote)
     assert code == 0, output
-    assert servobench(monkeypatch, *asked, str(tmp_path / "local"), "--workers", "1", "--no-isolate") == 0
+    assert (
+        servobench(monkeypatch, *asked, str(tmp_path / "local"), "--workers", "1", "--no-isolate")
+        == 0
+    )
     assert 0 < finished_before < RUNS
     tables = [judged(results.load_runs(tmp_path / name)) for name in ("remote", "local")]
     pd.testing.assert_frame_equal(*tables, check_exact=True)

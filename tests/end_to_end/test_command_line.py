@@ -16,7 +16,17 @@ from servobench.harness.cli.terminal import ending_alike
 
 def test_a_run_leaves_tables_a_manifest_and_figures(output_of, tmp_path):
     out = tmp_path / "out"
-    arguments = ["run", "--plant", "kinematic", "--controller", "calibrated", "--task", "exp2", "--seed", "3"]
+    arguments = [
+        "run",
+        "--plant",
+        "kinematic",
+        "--controller",
+        "calibrated",
+        "--task",
+        "exp2",
+        "--seed",
+        "3",
+    ]
     assert "calibrated" in output_of(*arguments, "--set", "exp2.duration=3", "--out", out)
     runs, steps = pd.read_parquet(out / "runs.parquet"), pd.read_parquet(out / "steps.parquet")
     assert runs[["status", "seed", "mismatch"]].values.tolist() == [["completed", 3, "moderate"]]
@@ -34,14 +44,34 @@ def test_a_run_leaves_tables_a_manifest_and_figures(output_of, tmp_path):
 
 
 @pytest.mark.parametrize("plant", ["kinematic", pytest.param("bullet", marks=NEEDS_BULLET)])
-def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(output_of, tmp_path, plant):
+def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(
+    output_of, tmp_path, plant
+):
     tables = []
     for workers in ("1", "2"):
         out = tmp_path / workers
-        asked = ["--plants", plant, "--controllers", "ukf_mfac,constant", "--tasks", "exp2,random", "--seeds", "5:6"]
-        asked += ["--set", "exp2.duration=0.5", "--set", "random.duration=0.5", "--no-figures", "--no-report"]
+        asked = [
+            "--plants",
+            plant,
+            "--controllers",
+            "ukf_mfac,constant",
+            "--tasks",
+            "exp2,random",
+            "--seeds",
+            "5:6",
+        ]
+        asked += [
+            "--set",
+            "exp2.duration=0.5",
+            "--set",
+            "random.duration=0.5",
+            "--no-figures",
+            "--no-report",
+        ]
         output_of("compare", *asked, "--workers", workers, "--out", out)
-        tables.append([judged(pd.read_parquet(out / name)) for name in ("runs.parquet", "steps.parquet")])
+        tables.append(
+            [judged(pd.read_parquet(out / name)) for name in ("runs.parquet", "steps.parquet")]
+        )
     for single, double in zip(*tables, strict=True):
         assert len(single) >= 4
         pd.testing.assert_frame_equal(single, double, check_exact=True)
@@ -49,7 +79,15 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
 
 def test_a_run_without_figures_leaves_its_tables_only(output_of, tmp_path):
     out = tmp_path / "out"
-    arguments = ("run", "constant", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--no-figures")
+    arguments = (
+        "run",
+        "constant",
+        "--plant",
+        "kinematic",
+        "--set",
+        "exp2.duration=0.5",
+        "--no-figures",
+    )
     assert f"tables in {out}" in " ".join(output_of(*arguments, "--out", out).split())
     assert sorted(path.name for path in out.iterdir()) == [
         "SHA256SUMS", "manifest.json", "runs.parquet", "steps.parquet",
@@ -70,7 +108,19 @@ def test_tests_that_are_started_with_interrupts_ignored_can_interrupt_neverthele
     (tmp_path / "test_handler.py").write_text(
         "import signal\n\n\ndef test_it():\n    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
     )
-    tests = [sys.executable, "-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "test_handler.py"]
+    tests = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "conftest",
+        "-p",
+        "no:cacheprovider",
+        "test_handler.py",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    done = carried_out("sh", "-c", 'trap "" INT; exec "$@"', "sh", *tests, cwd=tmp_path, env=environment)
+    done = carried_out(
+        "sh", "-c", 'trap "" INT; exec "$@"', "sh", *tests, cwd=tmp_path, env=environment
+    )
     assert done.returncode == 0, done.stdout

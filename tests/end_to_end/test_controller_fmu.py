@@ -60,7 +60,10 @@ def original(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs and commands of a run of the original."""
     run = experiment(name)
     try:
-        rows = [(inputs_of(seen, reference), command.joint_velocity) for seen, reference, command in periods(run)]
+        rows = [
+            (inputs_of(seen, reference), command.joint_velocity)
+            for seen, reference, command in periods(run)
+        ]
     finally:
         run.plant.close()
     inputs, commands = zip(*rows, strict=True)
@@ -85,7 +88,8 @@ def test_an_exported_controller_equals_the_original_over_a_run(name, version):
 
 
 @pytest.mark.parametrize(
-    ("name", "version"), some(list(product(METHODS[:4], (2, 3))), ("ukf_mfac:published", 2), ("regression_mfac", 3))
+    ("name", "version"),
+    some(list(product(METHODS[:4], (2, 3))), ("ukf_mfac:published", 2), ("regression_mfac", 3)),
 )
 def test_fmpy_and_the_reference_run_find_no_problem(name, version):
     assert validate_by_fmpy(str(exported(name, version))) == []
@@ -131,7 +135,8 @@ def test_time_that_is_a_sum_of_steps_misses_no_sample(first, step):
         time = first
         for values, command in zip(inputs, commands, strict=True):
             controller.set(values)
-            np.testing.assert_allclose(controller.get(), command, rtol=0, atol=1e-6)  # a time has 10 digits before s
+            # A time has 10 digits before s
+            np.testing.assert_allclose(controller.get(), command, rtol=0, atol=1e-6)
             controller.step(time, step)
             time += step
 
@@ -151,12 +156,18 @@ def test_a_saved_state_goes_on_with_equal_bits_and_reset_begins_anew(version):
     inputs, _ = original("regression_mfac")
     with loaded("regression_mfac", version) as controller:
         fmu = controller.fmu
-        save, restore = (fmu.getFMUstate, fmu.setFMUstate) if version == 2 else (fmu.getFMUState, fmu.setFMUState)
+        save, restore = (
+            (fmu.getFMUstate, fmu.setFMUstate)
+            if version == 2
+            else (fmu.getFMUState, fmu.setFMUState)
+        )
         before = [controller.answer(k, inputs[k]) for k in range(30)]
         state = save()
         after = [controller.answer(k, inputs[k]) for k in range(30, PERIODS)]
         restore(state)
-        np.testing.assert_array_equal([controller.answer(k, inputs[k]) for k in range(30, PERIODS)], after)
+        np.testing.assert_array_equal(
+            [controller.answer(k, inputs[k]) for k in range(30, PERIODS)], after
+        )
         (fmu.freeFMUstate if version == 2 else fmu.freeFMUState)(state)
         fmu.reset()
         controller.start()
@@ -171,18 +182,27 @@ def test_inputs_that_are_not_finite_and_values_that_are_computed_are_refused():
             controller.fmu.setReal(controller.outputs[:1], [0.0])
 
 
-@pytest.mark.parametrize(("begin", "fault", "growth"), [(0.0, 1e-6, 0.0), (5.0, 1e-6, 0.0), (0.0, 0.0, 1e-10)])
+@pytest.mark.parametrize(
+    ("begin", "fault", "growth"), [(0.0, 1e-6, 0.0), (5.0, 1e-6, 0.0), (0.0, 0.0, 1e-10)]
+)
 def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch, begin, fault, growth):
     recorded = controller_fmu._step
 
     def faulty(servo, state, inputs):
         state, output = recorded(servo, state, inputs)
-        grown = map_arrays(lambda each: each if each.dtype == np.bool_ else each * (1.0 + growth), state)
+        grown = map_arrays(
+            lambda each: each if each.dtype == np.bool_ else each * (1.0 + growth), state
+        )
         return grown if growth else state, output + fault * (inputs["time"] >= begin)
 
     monkeypatch.setattr(controller_fmu, "_step", faulty)
-    with pytest.raises(ConfigurationError, match="over 5 periods it would differ from the original by .e-.., allowed"):
-        controller_fmu.controller_model(RunRequest("kinematic", "cfdl_mfac:published", "target", "none", 0), Settings())
+    with pytest.raises(
+        ConfigurationError,
+        match="over 5 periods it would differ from the original by .e-.., allowed",
+    ):
+        controller_fmu.controller_model(
+            RunRequest("kinematic", "cfdl_mfac:published", "target", "none", 0), Settings()
+        )
 
 
 def test_a_network_that_magnifies_rounding_errors_equals_the_original_in_every_step():

@@ -16,7 +16,19 @@ from typer.testing import CliRunner
 import generated_tables
 from kit import console
 from kit.browser import browser_page, find_browser
-from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
+from kit.documents import (
+    DOCS,
+    PAGES,
+    PLACE,
+    ROOT,
+    anchors,
+    blocks,
+    find,
+    names,
+    read,
+    section,
+    tables,
+)
 from kit.foreign_fmu import build_crane
 from kit.own import install
 from servobench.controllers.methods import ESTIMATORS, LAWS
@@ -28,7 +40,9 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.tasks import TASKS
 
 GLOSSARY = sorted(anchors(section(read("concepts.md"), "Glossary")))
-PLACES = sorted({match.groups() for page in DOCS for match in PLACE.finditer(page.read_text(encoding="utf-8"))})
+PLACES = sorted(
+    {match.groups() for page in DOCS for match in PLACE.finditer(page.read_text(encoding="utf-8"))}
+)
 
 
 def links(text):
@@ -44,7 +58,9 @@ def test_every_relative_link_leads_somewhere(page):
         target = page.parent / path if path else page
         assert target.exists(), f"{page.name} links to {link}"
         if anchor:
-            assert anchor in anchors(target.read_text(encoding="utf-8")), f"{page.name} links to {link}"
+            assert anchor in anchors(target.read_text(encoding="utf-8")), (
+                f"{page.name} links to {link}"
+            )
 
 
 def test_the_pages_do_link():
@@ -54,14 +70,25 @@ def test_the_pages_do_link():
     assert sum(len(links(page.read_text(encoding="utf-8"))) for page in DOCS) > 30
 
 
-def test_what_the_readme_says_that_its_command_prints_is_what_it_prints(no_figures, monkeypatch, capsys, tmp_path):
-    sessions = [page for page in PAGES if "```console\n" in page.read_text(encoding="utf-8") and page not in DOCS]
+def test_what_the_readme_says_that_its_command_prints_is_what_it_prints(
+    no_figures, monkeypatch, capsys, tmp_path
+):
+    sessions = [
+        page
+        for page in PAGES
+        if "```console\n" in page.read_text(encoding="utf-8") and page not in DOCS
+    ]
     assert sessions == [PAGES[0]]  # test_first_hour.py carries those of the site out
-    assert console.carry_out(PAGES[0].read_text(encoding="utf-8"), monkeypatch, capsys, tmp_path) == 1
+    assert (
+        console.carry_out(PAGES[0].read_text(encoding="utf-8"), monkeypatch, capsys, tmp_path) == 1
+    )
 
 
 def test_another_output_than_that_of_the_page_is_found():
-    told, printed = console.plain(" a 1 5\n...\n c 3 99\n"), console.plain(" a 1 7\n b 5\n c 3 7*\n")
+    told, printed = (
+        console.plain(" a 1 5\n...\n c 3 99\n"),
+        console.plain(" a 1 7\n b 5\n c 3 7*\n"),
+    )
     console.compare("it", told, printed)
     with pytest.raises(AssertionError, match="does not print 'c 4'"):
         console.compare("it", console.plain(" a 1 2\n...\n c 4 99\n"), printed)
@@ -76,7 +103,11 @@ def test_every_piece_of_code_that_is_named_exists(path, name):
 
 def first_column(page, heading):
     return {
-        name for _, header, rows in tables(read(page)) if header[0] == heading for row in rows for name in names(row[0])
+        name
+        for _, header, rows in tables(read(page))
+        if header[0] == heading
+        for row in rows
+        for name in names(row[0])
     }
 
 
@@ -118,10 +149,14 @@ def installed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("controller", ["nominal_rate", "nominal_broyden"])
 def test_the_controllers_of_the_example_settle_on_a_real_plant(installed, controller):
-    installed(read("examples/nominal-rate/pyproject.toml"), read("examples/nominal-rate/nominal_rate.py"))
+    installed(
+        read("examples/nominal-rate/pyproject.toml"), read("examples/nominal-rate/nominal_rate.py")
+    )
     assert controller in registry.controller_names()
     request = RunRequest("kinematic", controller, "exp2", "moderate", 3)
-    settings = read_settings(None, ["nominal_rate.gain=1.5", "nominal_broyden.law.proportional_gain=1.5"])
+    settings = read_settings(
+        None, ["nominal_rate.gain=1.5", "nominal_broyden.law.proportional_gain=1.5"]
+    )
     row = run_experiment(request, settings).row
     assert row["status"] == "completed"
     assert row["settling_time_s"] < 6.0
@@ -143,7 +178,12 @@ def test_the_mapping_of_the_example_closes_a_loop_on_an_fmu(tmp_path):
     mapping.write_text(blocks(section(read("plants.md"), "`fmu:PATH.toml`, any FMU"), "toml")[0])
     plant = f"fmu:{mapping}"
     settings = read_settings(
-        None, ["ukf_mfac.initial.source=probe", "target.target=[0.2, 0.7]", f"{plant}.sensing.feature_noise=0.0"]
+        None,
+        [
+            "ukf_mfac.initial.source=probe",
+            "target.target=[0.2, 0.7]",
+            f"{plant}.sensing.feature_noise=0.0",
+        ],
     )
     result = run_experiment(RunRequest(plant, "ukf_mfac", "target", "none", 0), settings)
     assert result.row["settling_time_s"] < 8.0
@@ -155,35 +195,72 @@ def overhangs(places: list[Path], width: int) -> list[int]:
     """Return by how many pixels a table of each page is wider than its room in a window of some width, at most."""
     over = "Math.max(...[...document.querySelectorAll('.table-wrapper')].map(t => t.scrollWidth - t.clientWidth))"
     with tempfile.TemporaryDirectory() as profile, browser_page(Path(profile)) as page:
-        page.call("Emulation.setDeviceMetricsOverride", width=width, height=1000, deviceScaleFactor=1, mobile=False)
+        page.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=1000,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         return [page.open(place) or int(page.evaluate(over)) for place in places]
 
 
 def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     pytest.importorskip("sphinx", reason="the extra docs is not installed")
-    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", "-b", "html"]
-    done = subprocess.run([*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "--fail-on-warning",
+        "--keep-going",
+        "--quiet",
+        "-b",
+        "html",
+    ]
+    done = subprocess.run(
+        [*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     index = (tmp_path / "index.html").read_text(encoding="utf-8")
-    places = [page.with_suffix(".html").name for page in (*DOCS, ROOT / "docs" / "worked_example.ipynb")]
+    places = [
+        page.with_suffix(".html").name for page in (*DOCS, ROOT / "docs" / "worked_example.ipynb")
+    ]
     assert [place for place in places if f'href="{place}"' not in index] == ["index.html"]
-    shown = re.sub(r"<[^>]*>", "", index[index.index("<article") :].replace("<table", "TABLE <table"))
-    order = ("make run", "servobench run --plant", "TABLE", "Start", "How to", "Reference", "Explanation")
+    shown = re.sub(
+        r"<[^>]*>", "", index[index.index("<article") :].replace("<table", "TABLE <table")
+    )
+    order = (
+        "make run",
+        "servobench run --plant",
+        "TABLE",
+        "Start",
+        "How to",
+        "Reference",
+        "Explanation",
+    )
     places = [shown.index(word) for word in order]
     assert places == sorted(places)
     if find_browser() is not None:
-        assert max(overhangs([tmp_path / "index.html", tmp_path / "methods_reference.html"], 1024)) <= 0
+        assert (
+            max(overhangs([tmp_path / "index.html", tmp_path / "methods_reference.html"], 1024))
+            <= 0
+        )
     loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]*)"', index)
     assert loaded
     assert [place for place in loaded if "//" in place] == []  # it opens without a network
     api = (tmp_path / "api.html").read_text(encoding="utf-8")
     api = re.sub(r"<[^>]*>", "", api)
-    assert all(words in api for words in ("def run(", "def compare(", "def load(", "class Command:", "def step("))
+    assert all(
+        words in api
+        for words in ("def run(", "def compare(", "def load(", "class Command:", "def step(")
+    )
 
 
 def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    made = CliRunner().invoke(app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2", "--no-figures"])
+    made = CliRunner().invoke(
+        app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2", "--no-figures"]
+    )
     assert made.exit_code == 0, made.output
     (tmp_path / "first").symlink_to("results/latest")
     for code in blocks(read("results.md"), "python"):
@@ -201,13 +278,21 @@ def test_words_of_the_field_are_linked_to_the_glossary_where_they_first_appear(n
     assert {"aid", "exp1-to-exp4", "feature", "mismatch", "ukf"} <= linked
     for anchor in linked:
         first = re.search(rf"\[`?([^]`]*)`?\]\((?:docs/)?concepts\.md#{anchor}\)", text)
-        before = re.sub(r"^[|#!].*", "", console.FENCED.sub("", text[: first.start()]), flags=re.MULTILINE)
-        assert not re.search(rf"(?<![\w/-]){re.escape(first[1])}(?!\w)", before), f"{first[1]} stands before its link"
+        before = re.sub(
+            r"^[|#!].*", "", console.FENCED.sub("", text[: first.start()]), flags=re.MULTILINE
+        )
+        assert not re.search(rf"(?<![\w/-]){re.escape(first[1])}(?!\w)", before), (
+            f"{first[1]} stands before its link"
+        )
 
 
-def test_pages_install_from_the_clone_until_a_release_is_published_and_one_word_switches_them(monkeypatch):
+def test_pages_install_from_the_clone_until_a_release_is_published_and_one_word_switches_them(
+    monkeypatch,
+):
     pages = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
-    assert [name for name, text in pages.items() if re.search(r"pip install '?servobench", text)] == []
+    assert [
+        name for name, text in pages.items() if re.search(r"pip install '?servobench", text)
+    ] == []
     shown = {name for name, text in pages.items() if "pip install './servobench" in text}
     assert shown == {"README.md", "docs/five_minutes.md", "docs/installation.md"}
     monkeypatch.setattr(generated_tables, "RELEASED", True)
@@ -240,11 +325,17 @@ def test_the_table_of_equations_has_each_once_and_the_code_names_it_too():
             found += range(int(first), int(last or first) + 1)
         return found
 
-    rows = next(rows for _, header, rows in tables(read("methods_reference.md")) if header[0] == "equation")
+    rows = next(
+        rows for _, header, rows in tables(read("methods_reference.md")) if header[0] == "equation"
+    )
     assert sorted(number for row in rows for number in numbers(row[0])) == list(range(1, 47))
     for equations, _, where in rows:
         for path, _ in PLACE.findall(where):
             text = (ROOT / path).read_text(encoding="utf-8")
-            told = {n for found in re.findall(r"eqs?\. ([\d–\-, and]+)", text) for n in numbers(found)}
+            told = {
+                n for found in re.findall(r"eqs?\. ([\d–\-, and]+)", text) for n in numbers(found)
+            }
             if not path.startswith("tests/"):
-                assert told >= set(numbers(equations)), f"{path} does not name all of eqs. {equations}"
+                assert told >= set(numbers(equations)), (
+                    f"{path} does not name all of eqs. {equations}"
+                )

@@ -21,7 +21,8 @@ from servobench.plant.contract.faults import ConfigurationError
 SHOWN = re.compile(r"^ {4,6}(?:\$ )?servobench (.*)$", re.MULTILINE)
 REMARK = re.compile(r"\s+#\s.*$|\s{2,}\S.*$")
 CONTINUED = re.compile(r"\s*\\\n\s+")
-BATCHES = ("run", "compare", "sweep", "robustness", "suite", "claims")  # carried out up to the first worker
+# Carried out up to the first worker
+BATCHES = ("run", "compare", "sweep", "robustness", "suite", "claims")
 QUICK = ("plants", "controllers", "tasks", "sensing", "init", "new", "check")  # carried out whole
 ONLY_READ = {
     "fmu": "compiles a model, which test_robot_commands.py does",
@@ -39,10 +40,18 @@ ONLY_READ = {
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
+# Files of the reader
 OWN = (
-    "my_ur10e.yaml", "my_world.toml", "my_arm.urdf", "mine.toml", "twin.toml", "crane.toml", "planar", "nominal_rate",
+    "my_ur10e.yaml",
+    "my_world.toml",
+    "my_arm.urdf",
+    "mine.toml",
+    "twin.toml",
+    "crane.toml",
+    "planar",
+    "nominal_rate",
     "learned",
-)  # yours  # fmt: skip
+)
 
 
 def shown_lines():
@@ -73,16 +82,27 @@ def test_every_line_is_one_that_the_command_line_reads(words):
     command = typer.main.get_command(app)
     context = command.make_context("servobench", list(words))
     while hasattr(command, "resolve_command"):
-        name, command, rest = command.resolve_command(context, context._protected_args + context.args)
+        name, command, rest = command.resolve_command(
+            context, context._protected_args + context.args
+        )
         if "--help" not in rest:
-            with suppress(ConfigurationError) if own else nullcontext():  # of a file that is the reader's
+            with (
+                suppress(ConfigurationError) if own else nullcontext()
+            ):  # of a file that is the reader's
                 context = command.make_context(name, rest, parent=context)
-    options = {option for each in command.params for option in (*each.opts, *each.secondary_opts)} | {"--help"}
+    options = {
+        option for each in command.params for option in (*each.opts, *each.secondary_opts)
+    } | {"--help"}
     assert {word for word in words if word.startswith("--")} <= options
 
 
 @pytest.mark.parametrize(
-    "words", [line for line in LINES if line.values[0][0] in BATCHES and not any(own in line.id for own in OWN)]
+    "words",
+    [
+        line
+        for line in LINES
+        if line.values[0][0] in BATCHES and not any(own in line.id for own in OWN)
+    ],
 )
 def test_every_batch_that_a_page_shows_can_begin(monkeypatch, tmp_path, words):
     def stop(*_, **__):
@@ -101,7 +121,12 @@ def test_every_batch_that_a_page_shows_can_begin(monkeypatch, tmp_path, words):
 
 
 @pytest.mark.parametrize(
-    "words", [line for line in LINES if line.values[0][0] in QUICK and not any(own in line.id for own in OWN)]
+    "words",
+    [
+        line
+        for line in LINES
+        if line.values[0][0] in QUICK and not any(own in line.id for own in OWN)
+    ],
 )
 def test_every_quick_line_does_what_it_says(output_of, monkeypatch, tmp_path, words):
     monkeypatch.chdir(tmp_path)

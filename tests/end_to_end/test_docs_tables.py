@@ -20,7 +20,13 @@ from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.result import COMPLETED, CRASHED, NUMERICAL_ERROR, OUT_OF_MEMORY, TIMED_OUT
+from servobench.harness.run.result import (
+    COMPLETED,
+    CRASHED,
+    NUMERICAL_ERROR,
+    OUT_OF_MEMORY,
+    TIMED_OUT,
+)
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.sensing import SensingConfig
@@ -38,13 +44,22 @@ def config_classes():
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
     whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
     tasks = [type(entry.default) for entry in TASKS.values()]
-    common = [AidsConfig, InitialConfig, TrainingConfig, RunSettings, SensingConfig, MechanicsConfig]
+    common = [
+        AidsConfig,
+        InitialConfig,
+        TrainingConfig,
+        RunSettings,
+        SensingConfig,
+        MechanicsConfig,
+    ]
     return {kind for kind in (*parts, *whole, *tasks, *common) if dataclasses.fields(kind)}
 
 
 def test_all_settings_have_a_table_and_nothing_else_has():
     text = "".join(page.read_text(encoding="utf-8") for page in generated_tables.PAGES)
-    parts = [places for _, kind, places, *_ in generated_tables.PART.findall(text) if kind == "settings"]
+    parts = [
+        places for _, kind, places, *_ in generated_tables.PART.findall(text) if kind == "settings"
+    ]
     shown = [kind for places in parts for kind in generated_tables.labelled(places).values()]
     assert sorted(map(repr, shown)) == sorted(map(repr, config_classes()))
 
@@ -57,10 +72,15 @@ def test_a_section_with_a_table_of_its_own_is_not_printed_again():
 
 def test_a_setting_that_several_classes_share_stands_once_and_names_those_that_have_it():
     laws = {name: LAWS[name].config for name in ("mfac", "pid")}
-    both = generated_tables.settings_table({"one": laws["mfac"], "two": laws["mfac"], "three": laws["pid"]})
+    both = generated_tables.settings_table(
+        {"one": laws["mfac"], "two": laws["mfac"], "three": laws["pid"]}
+    )
     assert both.count("| `gain` [1/s] | `one`, `two` | ") == 1
     assert both.count("| `proportional_gain` [1/s] | `three` | ") == 1
-    assert generated_tables.settings_table({"a": laws["pid"], "b": laws["pid"]}).count(" | all | ") == 5
+    assert (
+        generated_tables.settings_table({"a": laws["pid"], "b": laws["pid"]}).count(" | all | ")
+        == 5
+    )
 
 
 @pytest.mark.parametrize("page", generated_tables.PAGES, ids=lambda page: page.name)
@@ -92,7 +112,11 @@ def told_aids(cell):
 
 
 def test_the_table_of_controllers_has_their_parts_and_aids():
-    rows = next(rows for _, header, rows in tables(read("methods.md")) if header[:2] == ["controller", "estimator"])
+    rows = next(
+        rows
+        for _, header, rows in tables(read("methods.md"))
+        if header[:2] == ["controller", "estimator"]
+    )
     assert sorted(name for row in rows for name in names(row[0])) == sorted(registry.CONTROLLERS)
     for controllers, estimator, law, aids, networks, truth in rows:
         for name in names(controllers):
@@ -103,7 +127,9 @@ def test_the_table_of_controllers_has_their_parts_and_aids():
             config = entry.config()
             assert type(config.estimator) is ESTIMATORS[names(estimator)[0]].config
             assert type(config.law) is LAWS[names(law)[0]].config
-            assert config.aids == AidsConfig(**({} if name.endswith(":published") else told_aids(aids)))
+            assert config.aids == AidsConfig(
+                **({} if name.endswith(":published") else told_aids(aids))
+            )
             assert hasattr(config, "training") == (networks != "none")
 
 
@@ -120,23 +146,39 @@ def short_runs():
 
 
 def test_every_diagnostic_is_told_and_exists(short_runs):
-    found = {column for run in short_runs for column in run.steps if column.startswith("diagnostic_")}
+    found = {
+        column for run in short_runs for column in run.steps if column.startswith("diagnostic_")
+    }
     rows = tables(section(read("methods_reference.md"), "Diagnostics"))[0][2]
     assert {f"diagnostic_{name}" for row in rows for name in names(row[0])} == found
 
 
 def test_every_column_of_runs_is_told_in_order(short_runs):
     page = section(read("results.md"), "`runs.parquet`: a row a run")
-    told = [names(row[0])[0] for _, header, rows in tables(page) if header[0] == "column" for row in rows]
+    told = [
+        names(row[0])[0]
+        for _, header, rows in tables(page)
+        if header[0] == "column"
+        for row in rows
+    ]
     only_by_pose = [name for name, metric in METRICS.items() if metric.values is None]
     varied = [name for name in told if "." in name]  # settings of a sweep, by their keys
-    assert [name for name in told if name not in (*only_by_pose, *varied)] == list(short_runs[0].row)
+    assert [name for name in told if name not in (*only_by_pose, *varied)] == list(
+        short_runs[0].row
+    )
 
 
 def test_every_column_of_steps_is_told_and_every_told_column_exists(short_runs):
     rows = tables(section(read("results.md"), "`steps.parquet`: a row a period"))[0][2]
-    places = {"feature": "[xyz]", "unit": "m", "joint": "(?:shoulder|elbow|wrist)[a-z_0-9]*", "name": r"\w+"}
-    patterns = [re.sub(r"<(\w+)>", lambda match: places[match[1]], names(row[0])[0]) for row in rows]
+    places = {
+        "feature": "[xyz]",
+        "unit": "m",
+        "joint": "(?:shoulder|elbow|wrist)[a-z_0-9]*",
+        "name": r"\w+",
+    }
+    patterns = [
+        re.sub(r"<(\w+)>", lambda match: places[match[1]], names(row[0])[0]) for row in rows
+    ]
     for run in short_runs:
         for column in run.steps:
             assert sum(bool(re.fullmatch(pattern, column)) for pattern in patterns) == 1, column
@@ -170,19 +212,31 @@ def test_the_profiles_have_the_magnitudes_of_the_code():
 def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
     found = tables(read("plants.md"))
     axes = [names(row[1])[0] for _, header, rows in found if header[0] == "axis" for row in rows]
-    words = [names(row[0])[0] for _, header, rows in found if header[0] == "word" for row in rows if names(row[0])]
+    words = [
+        names(row[0])[0]
+        for _, header, rows in found
+        if header[0] == "word"
+        for row in rows
+        if names(row[0])
+    ]
     assert {example.partition("=")[0] for example in (*axes, *words)} == set(AXES)
     for example in (*axes, *words):
         assert Mismatch.parse(example).size(example.partition("=")[0]) > 0.0
 
 
 def test_the_keys_of_a_mapping_are_those_of_the_code():
-    rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "key" and header[1] == "wanted")
+    rows = next(
+        rows
+        for _, header, rows in tables(read("plants.md"))
+        if header[0] == "key" and header[1] == "wanted"
+    )
     mapping = FmuMapping(Path("crane.fmu"), ("push",), ("place",))
     wanted = set()
     for key in vars(mapping).keys() - {"parameters", "nominal"}:
         part = getattr(mapping, key)
-        wanted |= {f"{key}.{name}" for name in vars(part)} if dataclasses.is_dataclass(part) else {key}
+        wanted |= (
+            {f"{key}.{name}" for name in vars(part)} if dataclasses.is_dataclass(part) else {key}
+        )
     assert {name for row in rows for name in names(row[0])} == wanted
 
 
@@ -202,18 +256,26 @@ def test_an_attribute_without_a_line_in_its_docstring_is_refused():
         def half(self):
             """Half of it."""
 
-    assert generated_tables.attributes(Given) == {"size": "(n,), m, in two lines", "half": "half of it"}
+    assert generated_tables.attributes(Given) == {
+        "size": "(n,), m, in two lines",
+        "half": "half of it",
+    }
     Given.__doc__ = "A thing."
     with pytest.raises(ValueError, match="Given has no line on size below Attributes:"):
         generated_tables.attributes(Given)
 
 
 def test_signatures_are_python():
-    text = generated_tables.interface(["servobench.run", "servobench.Controller(*)", "servobench.PlantSetup"])
+    text = generated_tables.interface(
+        ["servobench.run", "servobench.Controller(*)", "servobench.PlantSetup"]
+    )
     function, kind, setup = re.findall(r"```python\n(.*?)\n```", text, re.DOTALL)
     (parsed,) = ast.parse(function).body
     assert [each.arg for each in parsed.args.args] == ["controller", "plant"]
     (parsed,) = ast.parse(kind).body
-    assert [each.name for each in parsed.body if isinstance(each, ast.FunctionDef)][:2] == ["reset", "step"]
+    assert [each.name for each in parsed.body if isinstance(each, ast.FunctionDef)][:2] == [
+        "reset",
+        "step",
+    ]
     (parsed,) = ast.parse(setup).body
     assert [each.target.id for each in parsed.body[1:]] == ["model", "start", "period", "nominal"]

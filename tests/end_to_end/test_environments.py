@@ -20,7 +20,10 @@ FAILS_AT_ONCE = 11  # of twenty seeds of `moderate` the one whose stretched arm 
 @pytest.mark.parametrize(
     ("plant", "task"),
     [
-        *(("kinematic", task) for task in some(TASKS, "circle", "random", "waypoints", "plane_turn")),
+        *(
+            ("kinematic", task)
+            for task in some(TASKS, "circle", "random", "waypoints", "plane_turn")
+        ),
         ("fmu", "circle"),
         *(pytest.param(plant, "exp1", marks=NEEDS[plant]) for plant in RENDERED),
     ],

@@ -25,11 +25,21 @@ EXAMPLES = {
 LEARNING = {"train_policy", "learned_policy"}  # tested below
 ROBOTS = {"on_a_ur"}  # tests/end_to_end/test_on_a_ur.py
 MOTIONS = {"excite"}  # tests/harness/test_identification.py moves an arm by it
-LAWS = {"damped_inverse": "DampedInverse", "kalman_inverse": "KalmanInverse", "trained_inverse": "TrainedInverse"}
+LAWS = {
+    "damped_inverse": "DampedInverse",
+    "kalman_inverse": "KalmanInverse",
+    "trained_inverse": "TrainedInverse",
+}
 
 
 def test_every_example_is_listed_here():
-    assert {path.stem for path in FOLDER.glob("*.py")} == {*EXAMPLES, *LEARNING, *LAWS, *MOTIONS, *ROBOTS}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {
+        *EXAMPLES,
+        *LEARNING,
+        *LAWS,
+        *MOTIONS,
+        *ROBOTS,
+    }
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -41,13 +51,19 @@ def test_an_example_runs_and_prints(name, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_law_of_ones_own_keeps_up_with_a_method_of_the_bench_with_the_aids_and_only_with_them(law):
+def test_a_law_of_ones_own_keeps_up_with_a_method_of_the_bench_with_the_aids_and_only_with_them(
+    law,
+):
     place = f"{FOLDER / law}.py:{LAWS[law]}"
     assert servobench.check_controller(place).ok
     names = [LAWS[law], f"{LAWS[law]}Alone", "ukf_mfac"]
     short = {"random": {"duration": 3.0}, "circle": {"lap_time": 4.0, "radius": 0.15}}
-    runs = servobench.compare([place, f"{place}Alone", names[2]], tasks=list(short), seeds=2, settings=short)
-    middle = runs.groupby(["task", "controller"])[["settling_time_s", "rms_error_evaluated"]].median()
+    runs = servobench.compare(
+        [place, f"{place}Alone", names[2]], tasks=list(short), seeds=2, settings=short
+    )
+    middle = runs.groupby(["task", "controller"])[
+        ["settling_time_s", "rms_error_evaluated"]
+    ].median()
     own, alone, method = (middle.loc["random", "settling_time_s"][name] for name in names)
     assert own < 1.5 * method
     assert own < alone
@@ -65,7 +81,9 @@ def test_a_learned_policy_is_the_network_that_was_written(tmp_path, monkeypatch)
     layers = [(rng.normal(0.0, 0.3, (m, n)), rng.normal(0.0, 0.1, m)) for n, m in pairwise(sizes)]
     np.savez("policy.npz", *(part.astype(np.float32) for layer in layers for part in layer))
     steps = servobench.run("./learned_policy.py", task="exp2", seed=2).steps
-    (w1, b1), (w2, b2), (w3, b3) = [tuple(part.astype(np.float32).astype(float) for part in each) for each in layers]
+    (w1, b1), (w2, b2), (w3, b3) = [
+        tuple(part.astype(np.float32).astype(float) for part in each) for each in layers
+    ]
     for feature in steps.filter(regex="^feature_.*_m$").to_numpy()[:40]:
         np.testing.assert_allclose(env.observation.feature, feature, rtol=1e-12)
         seen, *_ = env.step(w3 @ np.tanh(w2 @ np.tanh(w1 @ seen + b1) + b2) + b3)
@@ -73,8 +91,12 @@ def test_a_learned_policy_is_the_network_that_was_written(tmp_path, monkeypatch)
 
 
 def test_a_policy_is_trained_and_written(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed, and no requirement")
-    monkeypatch.setattr(sys, "argv", ["train_policy.py", "--steps", "1", "--out", str(tmp_path / "policy.npz")])
+    pytest.importorskip(
+        "stable_baselines3", reason="Stable-Baselines3 is not installed, and no requirement"
+    )
+    monkeypatch.setattr(
+        sys, "argv", ["train_policy.py", "--steps", "1", "--out", str(tmp_path / "policy.npz")]
+    )
     runpy.run_path(str(FOLDER / "train_policy.py"), run_name="__main__")
     assert "policy.npz: trained for 1 steps" in capsys.readouterr().out
     with np.load(tmp_path / "policy.npz") as kept:

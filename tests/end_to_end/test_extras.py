@@ -14,14 +14,27 @@ from servobench.harness.config import registry
 from servobench.harness.config.installation import EXTRAS
 from servobench.plant.contract.faults import ConfigurationError
 
-HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", "pybullet", "casadi", "fmpy", "cv2", *EXTRAS)
-SLOW = ("psutil", "multiprocessing", "importlib.metadata", "tomllib")  # together a fifth of a help page's time
+HEAVY = (
+    "numpy",
+    "scipy",
+    "pandas",
+    "matplotlib",
+    "pydantic",
+    "pybullet",
+    "casadi",
+    "fmpy",
+    "cv2",
+    *EXTRAS,
+)
+# Together a fifth of a help page's time
+SLOW = ("psutil", "multiprocessing", "importlib.metadata", "tomllib")
 QUICK = ("run", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", "out")
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("compare", "--help")])
 def test_a_help_text_imports_nothing_heavy(arguments):
-    modules = {*HEAVY, *SLOW} if len(arguments) == 1 else set(HEAVY) - {"pydantic"}  # with which typer reads options
+    # With which typer reads options
+    modules = {*HEAVY, *SLOW} if len(arguments) == 1 else set(HEAVY) - {"pydantic"}
     script = f"""
 import sys
 sys.argv = ["servobench", *{arguments!r}]
@@ -69,7 +82,11 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
     [
         ("jinja2", "report", ("report", "made")),
         ("optuna", "tune", ("tune", "--trials", "1")),
-        ("distributed", "cluster", ("sweep", "--out", "out", "--seeds", "1", "--scheduler", "tcp://127.0.0.1:9")),
+        (
+            "distributed",
+            "cluster",
+            ("sweep", "--out", "out", "--seeds", "1", "--scheduler", "tcp://127.0.0.1:9"),
+        ),
         pytest.param(
             "imageio_ffmpeg",
             "animation",
@@ -93,16 +110,22 @@ def test_without_an_engine_no_film_is_made_and_a_line_says_what_to_install(tmp_p
     done = servobench_without(("pybullet", "mujoco"), ("record", "--plant", "kinematic"), tmp_path)
     extra, module = ("mujoco", "mujoco") if extras.has_no_wheel() else ("bullet", "pybullet")
     assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
-    assert done.stderr.startswith(f"servobench: plant '{extra}' needs {module}: pip install 'servobench[{extra}]'")
+    assert done.stderr.startswith(
+        f"servobench: plant '{extra}' needs {module}: pip install 'servobench[{extra}]'"
+    )
     assert done.stderr.count("\n") == 1
 
 
 def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and_says_why(tmp_path):
-    done = servobench_without(("pybullet", "mujoco"), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path)
+    done = servobench_without(
+        ("pybullet", "mujoco"), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path
+    )
     assert (done.returncode, done.stderr) == (0, "")
     told, *_, folder = done.stdout.splitlines()
     wanted = ("mujoco", "mujoco") if extras.has_no_wheel() else ("bullet", "pybullet")
-    assert told.startswith("no plant is named, so this run is on kinematic: plant '{}' needs {}: ".format(*wanted))
+    assert told.startswith(
+        "no plant is named, so this run is on kinematic: plant '{}' needs {}: ".format(*wanted)
+    )
     assert folder.endswith(" in out")
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["engines"] == {}
     listed = servobench_without(("pybullet",), ("plants",), tmp_path).stdout
@@ -111,7 +134,9 @@ def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and
 
 @NEEDS_MUJOCO
 def test_without_pybullet_mujoco_is_the_rendered_plant(monkeypatch):
-    monkeypatch.setattr(registry, "check_installed", lambda needs, what: needs == ("pybullet",) and refuse(what))
+    monkeypatch.setattr(
+        registry, "check_installed", lambda needs, what: needs == ("pybullet",) and refuse(what)
+    )
     line = "" if extras.has_no_wheel() else "plant 'bullet' needs what is not here"
     assert registry.default_plant() == ("mujoco", line)
 
@@ -138,14 +163,20 @@ def test_a_machine_that_cannot_render_is_told_what_to_install(tmp_path, word, re
 
 @NEEDS_BULLET
 def test_a_line_and_the_manifest_name_the_engine_that_renders(tmp_path):
-    done = servobench_without((), ("run", "--plant", "bullet", "--set", "exp2.duration=0.1", "--out", "out"), tmp_path)
+    done = servobench_without(
+        (), ("run", "--plant", "bullet", "--set", "exp2.duration=0.1", "--out", "out"), tmp_path
+    )
     engine = json.loads((tmp_path / "out" / "manifest.json").read_text())["engines"]["bullet"]
     assert engine.startswith(f"PyBullet {version('pybullet')}, software renderer TinyRenderer")
     assert f"bullet: {engine}\n" in done.stdout
 
 
-@pytest.mark.parametrize(("running", "compiled"), [((3, 11, 7), False), ((3, 12, 0), True), ((3, 13, 1), True)])
-def test_where_pybullet_has_no_wheel_the_line_says_that_it_is_compiled(monkeypatch, running, compiled):
+@pytest.mark.parametrize(
+    ("running", "compiled"), [((3, 11, 7), False), ((3, 12, 0), True), ((3, 13, 1), True)]
+)
+def test_where_pybullet_has_no_wheel_the_line_says_that_it_is_compiled(
+    monkeypatch, running, compiled
+):
     monkeypatch.setattr(extras.sys, "version_info", running)
     line = extras.missing_extra(ModuleNotFoundError("No module", name="pybullet"), "a film")
     assert line.startswith("a film needs pybullet: pip install 'servobench[bullet]'")

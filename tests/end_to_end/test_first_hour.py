@@ -24,7 +24,9 @@ from kit.robots import calibration_text, odd_urdf
 from servobench.harness.batch import results
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
-ORDER = re.findall(r"^(?:.*<)?(\w+)>?$", "".join(blocks(read("index.md"), "{toctree}")), re.MULTILINE)
+ORDER = re.findall(
+    r"^(?:.*<)?(\w+)>?$", "".join(blocks(read("index.md"), "{toctree}")), re.MULTILINE
+)
 SESSIONS = [page.stem for page in DOCS if "```console\n" in page.read_text(encoding="utf-8")]
 HOUR = ("five_minutes", "own_controller", "own_robot", "own_sensing", "fmu", "learning")
 SITE = sorted({*SESSIONS, *HOUR}, key=ORDER.index)
@@ -81,7 +83,9 @@ class Reader:
             return
         command = ["bash", "-e", "-c", block] if kind == "shell" else [sys.executable, "-c", block]
         made = carried_out(*command, cwd=self.folder, env=self.environment, timeout=3600)
-        assert made.returncode == 0, f"{block}\nexit code {made.returncode}: {made.stdout}{made.stderr}"
+        assert made.returncode == 0, (
+            f"{block}\nexit code {made.returncode}: {made.stdout}{made.stderr}"
+        )
 
     def call(self, line: str) -> None:
         """Carry out a line in this process."""
@@ -103,7 +107,9 @@ def lay_out(reader: Reader, text: str) -> None:
         shutil.copytree(ROOT / "docs" / "examples" / "nominal-rate", folder / "nominal-rate")
     if "shadow first" in text:
         reader.call("servobench run --plant kinematic --out first")
-        pd.read_parquet(folder / "first" / "steps.parquet").to_csv(folder / "robot.csv", index=False)
+        pd.read_parquet(folder / "first" / "steps.parquet").to_csv(
+            folder / "robot.csv", index=False
+        )
     if "mine.fmu" in text:
         reader.call("servobench fmu export -o mine.fmu")
 
@@ -118,7 +124,9 @@ def reader(monkeypatch, tmp_path):
     if not NIGHTLY:
         monkeypatch.setattr("servobench.harness.batch.blocks.available_processors", lambda: 1)
         monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
-        monkeypatch.setattr("servobench.harness.pictures.report.write_report", lambda made, _: made / results.RUNS)
+        monkeypatch.setattr(
+            "servobench.harness.pictures.report.write_report", lambda made, _: made / results.RUNS
+        )
     return Reader(folder, tools, monkeypatch)
 
 
@@ -127,7 +135,9 @@ def reader(monkeypatch, tmp_path):
 def test_what_a_page_shows_is_what_comes_out(reader, monkeypatch, capsys, page):
     text = read(f"{page}.md")
     lay_out(reader, text)
-    count = console.carry_out(text, monkeypatch, capsys, reader.folder, reader.paste if page in HOUR else None)
+    count = console.carry_out(
+        text, monkeypatch, capsys, reader.folder, reader.paste if page in HOUR else None
+    )
     assert count > 0 or page in HOUR
 
 
@@ -136,5 +146,12 @@ def test_the_first_hour_begins_the_site_its_pages_leave_folders_of_their_own_and
     texts = [read(f"{page}.md") for page in HOUR]
     made = [set(re.findall(r"--out (\w+)", text)) for text in texts]
     assert len(set.union(*made)) == sum(map(len, made))
-    pasted = [what for text in texts for kind, what, _ in console.steps(text) if kind in ("shell", "python")]
-    assert [words for words in (*LEFT_OUT, *LONG) if not any(words in block for block in pasted)] == []
+    pasted = [
+        what
+        for text in texts
+        for kind, what, _ in console.steps(text)
+        if kind in ("shell", "python")
+    ]
+    assert [
+        words for words in (*LEFT_OUT, *LONG) if not any(words in block for block in pasted)
+    ] == []

@@ -9,12 +9,18 @@ import pytest
 from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe_with, mapping
 
-FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
+FMI1 = describe_with(
+    2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"'
+)
 TYPES = '<TypeDefinitions><SimpleType name="Rate"><Real unit="deg/s"/></SimpleType></TypeDefinitions><ModelVariables>'
-IN_DEGREES = describe_with(2, "<ModelVariables>", TYPES).replace('<Real start="0.0"/>', '<Real declaredType="Rate"/>')
+IN_DEGREES = describe_with(2, "<ModelVariables>", TYPES).replace(
+    '<Real start="0.0"/>', '<Real declaredType="Rate"/>'
+)
 SPEED = '<UnitDefinitions><Unit name="speed"><BaseUnit s="-1" rad="1" factor="{}"/></Unit></UnitDefinitions><TypeD'
 SCALED = IN_DEGREES.replace('"deg/s"', '"speed"').replace("<TypeD", SPEED)
-DIFFERENCE = SCALED.format('0.0174533" offset="3').replace('"speed"/></S', '"speed" relativeQuantity="true"/></S')
+DIFFERENCE = SCALED.format('0.0174533" offset="3').replace(
+    '"speed"/></S', '"speed" relativeQuantity="true"/></S'
+)
 METRES = SPEED.replace('s="-1" rad="1" factor="{}"', 'm="1"').replace("<TypeD", "<ModelV")
 IN_METRES = describe_with(2, "<ModelV", METRES).replace("<Real/>", '<Real unit="speed"/>')
 SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
@@ -30,12 +36,30 @@ def temporary(tmp_path, monkeypatch):
     assert list(folder.iterdir()) == []
 
 
-def run(monkeypatch, tmp_path: Path, version: int, *options: str, more: str = "") -> tuple[int, Path]:
+def run(
+    monkeypatch, tmp_path: Path, version: int, *options: str, more: str = ""
+) -> tuple[int, Path]:
     (tmp_path / "crane.toml").write_text(mapping(version) + more)
     out = tmp_path / "out"
     task = ["--task", "target", "--set", "target.target=[0.2,0.7]", "--set", "target.duration=1"]
-    start = ["--controller", "broyden", "--set", "broyden.initial.source=probe", "--mismatch", "none"]
-    arguments = ["run", "--plant", f"fmu:{tmp_path / 'crane.toml'}", *start, *task, "--out", str(out), *options]
+    start = [
+        "--controller",
+        "broyden",
+        "--set",
+        "broyden.initial.source=probe",
+        "--mismatch",
+        "none",
+    ]
+    arguments = [
+        "run",
+        "--plant",
+        f"fmu:{tmp_path / 'crane.toml'}",
+        *start,
+        *task,
+        "--out",
+        str(out),
+        *options,
+    ]
     return servobench(monkeypatch, *arguments), out
 
 
@@ -60,7 +84,9 @@ ARCHIVES = {
 
 
 @pytest.mark.parametrize("case", ARCHIVES)
-def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monkeypatch, tmp_path, temporary, capsys):
+def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(
+    case, monkeypatch, tmp_path, temporary, capsys
+):
     build, message = ARCHIVES[case]
     build(tmp_path / "crane.fmu")
     code, out = run(monkeypatch, tmp_path, 2, "--no-isolate")
@@ -75,17 +101,28 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
     assert list(tmp_path.rglob("evil.txt")) == []
 
 
-def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(output_of, monkeypatch, tmp_path):
+def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(
+    output_of, monkeypatch, tmp_path
+):
     path = tmp_path / "crane.fmu"
     build_crane(path, 2)
-    monkeypatch.setattr("servobench.fmus.inspection.validate_by_fmpy", lambda _: [])  # the crane has no ModelStructure
-    assert "no reference run inside; it was loaded and made ready for a run\n" in output_of("fmu", "validate", path)
+    # The crane has no ModelStructure
+    monkeypatch.setattr("servobench.fmus.inspection.validate_by_fmpy", lambda _: [])
+    assert "no reference run inside; it was loaded and made ready for a run\n" in output_of(
+        "fmu", "validate", path
+    )
     with zipfile.ZipFile(path) as archive:
         contents = {name: archive.read(name) for name in archive.namelist() if "." in name}
     path.unlink()
-    write(path, {name: b"text" if name.startswith("binaries") else each for name, each in contents.items()})
+    write(
+        path,
+        {name: b"text" if name.startswith("binaries") else each for name, each in contents.items()},
+    )
     output = output_of("fmu", "validate", path, code=1)
-    assert "problem: it cannot be made ready for a run: the library in crane.fmu cannot be loaded" in output
+    assert (
+        "problem: it cannot be made ready for a run: the library in crane.fmu cannot be loaded"
+        in output
+    )
     assert "it was loaded" not in output
 
 

@@ -38,13 +38,20 @@ parameters = {gain = 1.5}
 @pytest.mark.parametrize(("name", "version"), [("ukf_mfac:published", 2), ("regression_mfac", 3)])
 def test_an_exported_controller_as_an_fmu_equals_the_original_in_every_step(name, version):
     fmu = choose_controller(str(exported(name, version)))
-    native, plugged = (run(each, task="random", mismatch="moderate", seed=3, settings=SETTINGS) for each in (name, fmu))
+    native, plugged = (
+        run(each, task="random", mismatch="moderate", seed=3, settings=SETTINGS)
+        for each in (name, fmu)
+    )
     assert plugged.row["status"] == native.row["status"] == "completed"
     columns = [
-        column for column in native.steps if column.startswith(("q_", "y_", "u_", "command", "joint", "feature"))
+        column
+        for column in native.steps
+        if column.startswith(("q_", "y_", "u_", "command", "joint", "feature"))
     ]
     assert columns
-    difference = np.abs(plugged.steps[columns].to_numpy(float) - native.steps[columns].to_numpy(float))
+    difference = np.abs(
+        plugged.steps[columns].to_numpy(float) - native.steps[columns].to_numpy(float)
+    )
     assert np.nanmax(difference) < 1e-9
 
 
@@ -76,7 +83,9 @@ def test_a_mapping_names_the_variables_and_a_saved_state_goes_on_with_equal_bits
     _, again = go(observation, 20, 40)
     np.testing.assert_array_equal(again, straight)
     plant.restore(saved[0])
-    controller = build(resolve(request, Settings())).controller  # a new one, which goes on and begins anew
+    controller = build(
+        resolve(request, Settings())
+    ).controller  # a new one, which goes on and begins anew
     controller.restore(saved[1])
     np.testing.assert_array_equal(go(observation, 20, 40)[1], straight)
     observation = plant.reset(0)
@@ -115,7 +124,12 @@ def test_a_bad_mapping_is_refused_by_a_line(tmp_path, text, message):
     (tmp_path / "map.fmu").write_bytes(exported("ukf_mfac:published", 2).read_bytes())
     (tmp_path / "bad.toml").write_text(text)
     with pytest.raises(ConfigurationError, match=message) as refused:
-        build(resolve(RunRequest("kinematic", f"fmu:{tmp_path / 'bad.toml'}", "target", "none", 1), Settings()))
+        build(
+            resolve(
+                RunRequest("kinematic", f"fmu:{tmp_path / 'bad.toml'}", "target", "none", 1),
+                Settings(),
+            )
+        )
     assert "\n" not in str(refused.value)
 
 
@@ -123,7 +137,11 @@ def test_a_bad_mapping_is_refused_by_a_line(tmp_path, text, message):
     ("text", "period", "message"),
     [
         (MAPPING, 0.02, "map.fmu is meant for a period of 0.05 s, and run.period is 0.02 s"),
-        (MAPPING.replace("joints =", "# joints ="), 0.05, "no role of the mapping names the input joint_position[1]"),
+        (
+            MAPPING.replace("joints =", "# joints ="),
+            0.05,
+            "no role of the mapping names the input joint_position[1]",
+        ),
     ],
 )
 def test_an_unlikely_mapping_is_remarked_on_by_the_process_that_the_user_sees(
@@ -131,16 +149,36 @@ def test_an_unlikely_mapping_is_remarked_on_by_the_process_that_the_user_sees(
 ):
     (tmp_path / "map.fmu").write_bytes(exported("ukf_mfac:published", 2).read_bytes())
     (tmp_path / "mine.toml").write_text(text)
-    settings = "--set", "target.duration=0.2", "--set", f"run.period={period}", "--out", str(tmp_path / "out")
+    settings = (
+        "--set",
+        "target.duration=0.2",
+        "--set",
+        f"run.period={period}",
+        "--out",
+        str(tmp_path / "out"),
+    )
     name = str(tmp_path / "mine.toml")
     remark.cache_clear()
     assert (
-        servobench(monkeypatch, "run", "--controller", name, "--plant", "kinematic", "--task", "target", *settings) == 0
+        servobench(
+            monkeypatch,
+            "run",
+            "--controller",
+            name,
+            "--plant",
+            "kinematic",
+            "--task",
+            "target",
+            *settings,
+        )
+        == 0
     )
     assert sum(message in line for line in caplog.messages) == 1
 
 
 def test_an_fmu_without_the_names_of_exported_controllers_asks_for_a_mapping(tmp_path):
     build_pilot(tmp_path / "pilot.fmu")
-    with pytest.raises(ConfigurationError, match="has no joint_velocity_command, feature, reference.*pilot.toml"):
+    with pytest.raises(
+        ConfigurationError, match="has no joint_velocity_command, feature, reference.*pilot.toml"
+    ):
         find_controller(f"fmu:{tmp_path / 'pilot.fmu'}")

@@ -14,7 +14,11 @@ from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.fmu.world import FmuWorld
 
-NAMES = {"inputs": ("joint_velocity_command",), "joints": ("joint_position",), "features": ("ball_position",)}
+NAMES = {
+    "inputs": ("joint_velocity_command",),
+    "joints": ("joint_position",),
+    "features": ("ball_position",),
+}
 
 
 def without_co_simulation(version: int, target: Path) -> Path:
@@ -32,8 +36,15 @@ def without_co_simulation(version: int, target: Path) -> Path:
 @pytest.mark.parametrize("version", [2, 3])
 def test_an_integrated_fmu_agrees_with_its_co_simulation_also_at_stops(version, tmp_path):
     path = without_co_simulation(version, tmp_path / "exchange.fmu")
-    stops = {"joint_upper": np.full(6, 0.4), "joint_lower": np.full(6, -1.7), "home": np.full(6, 0.2)}
-    worlds = [FmuWorld(FmuMapping(file, **NAMES, parameters=stops), None, 0.05) for file in (path, cached_fmu(version))]
+    stops = {
+        "joint_upper": np.full(6, 0.4),
+        "joint_lower": np.full(6, -1.7),
+        "home": np.full(6, 0.2),
+    }
+    worlds = [
+        FmuWorld(FmuMapping(file, **NAMES, parameters=stops), None, 0.05)
+        for file in (path, cached_fmu(version))
+    ]
     for _ in range(2):
         held = 0
         for k in range(30):
@@ -56,11 +67,18 @@ def test_an_integrated_fmu_agrees_with_its_co_simulation_also_at_stops(version, 
 @pytest.mark.parametrize("version", [2, 3])
 def test_an_integrated_fmu_has_the_play_and_the_tool_of_its_co_simulation(version, tmp_path):
     path = without_co_simulation(version, tmp_path / "exchange.fmu")
-    mechanics = {"backlash": np.full(6, 0.035), "ripple": np.full(6, 0.03), "ripple_order": np.full(6, 8.0)}
+    mechanics = {
+        "backlash": np.full(6, 0.035),
+        "ripple": np.full(6, 0.03),
+        "ripple_order": np.full(6, 8.0),
+    }
     mechanics |= {"tool_frequency": np.array([12.0]), "tool_damping": np.array([0.02])}
     files = path, cached_fmu(version)
     # Play is updated at completed steps of the integrator.
-    worlds = [FmuWorld(FmuMapping(each, **NAMES, parameters=mechanics, period=0.005), None, 0.05) for each in files]
+    worlds = [
+        FmuWorld(FmuMapping(each, **NAMES, parameters=mechanics, period=0.005), None, 0.05)
+        for each in files
+    ]
     for k in range(40):
         for world in worlds:
             world.advance(np.linspace(0.4, 1.0, 6) * (1.0 if k < 15 else -1.0))
@@ -73,7 +91,9 @@ def test_what_an_fmu_refuses_within_the_solver_is_told(tmp_path):
     description = re.sub(r"<CoSimulation[^>]*/>", "", describe_exchange())
     path = build_crane(tmp_path / "crane.fmu", 2, description=description)
     world = FmuWorld(FmuMapping(path, **ROLES[2]), None, 0.05)
-    np.testing.assert_allclose(world.advance(np.array([0.2, -0.4])) - [0.3, 1.2], [0.01, -0.02], atol=1e-9)
+    np.testing.assert_allclose(
+        world.advance(np.array([0.2, -0.4])) - [0.3, 1.2], [0.01, -0.02], atol=1e-9
+    )
     with pytest.raises(FmuError, match="GetDerivatives returned error"):
         world.advance(np.array([99.0, 0.0]))
     world.close()

@@ -24,7 +24,14 @@ from servobench.fmus.compiler import (
     parse_platforms,
     this_platform,
 )
-from servobench.fmus.export import PACKAGES, ExportOptions, arm_layout, export_fmu, fingerprint, nominal_setup
+from servobench.fmus.export import (
+    PACKAGES,
+    ExportOptions,
+    arm_layout,
+    export_fmu,
+    fingerprint,
+    nominal_setup,
+)
 from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
@@ -51,7 +58,9 @@ def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
 
 
 def test_the_reference_run_agrees_with_play_ripple_and_a_flexible_tool(tmp_path):
-    own = KinematicConfig(mechanics=MechanicsConfig(backlash=0.02, ripple=0.02, tool_frequency=30.0))
+    own = KinematicConfig(
+        mechanics=MechanicsConfig(backlash=0.02, ripple=0.02, tool_frequency=30.0)
+    )
     options = ExportOptions(setup=replace(nominal_setup(), period=0.02), config=own)
     found = validate_fmu(export_fmu(tmp_path / "arm.fmu", options))
     assert found.deviation < 1e-12
@@ -129,13 +138,19 @@ from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.export import ExportOptions, export_fmu
 export_fmu(Path("again.fmu"), ExportOptions(int(sys.argv[1]), platforms=parse_platforms(sys.argv[2])))
 """
-WITH_ZIG = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed")
+WITH_ZIG = pytest.mark.skipif(
+    importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed"
+)
 
 
 @pytest.mark.parametrize("platforms", [this_platform().name, pytest.param("all", marks=WITH_ZIG)])
 @pytest.mark.parametrize("version", VERSIONS)
-def test_equal_inputs_give_equal_files_in_another_process_folder_and_time(version, platforms, tmp_path):
-    first = export_fmu(tmp_path / "first.fmu", ExportOptions(version, platforms=parse_platforms(platforms)))
+def test_equal_inputs_give_equal_files_in_another_process_folder_and_time(
+    version, platforms, tmp_path
+):
+    first = export_fmu(
+        tmp_path / "first.fmu", ExportOptions(version, platforms=parse_platforms(platforms))
+    )
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     changed = {"TMPDIR": str(elsewhere), "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo"}
@@ -160,7 +175,9 @@ MAGIC = {
 @WITH_ZIG
 @pytest.mark.parametrize("version", VERSIONS)
 def test_zig_puts_libraries_for_five_platforms_into_one_fmu(version, tmp_path):
-    path = export_fmu(tmp_path / "all.fmu", ExportOptions(version, platforms=parse_platforms("all")))
+    path = export_fmu(
+        tmp_path / "all.fmu", ExportOptions(version, platforms=parse_platforms("all"))
+    )
     assert set(MAGIC) == set(PLATFORMS)
     with zipfile.ZipFile(path) as archive:
         for name, (magic, machine, offset) in MAGIC.items():
@@ -173,7 +190,8 @@ def test_zig_puts_libraries_for_five_platforms_into_one_fmu(version, tmp_path):
                 content = content[start : start + size]
             assert content.startswith(magic), name
             assert content[offset:].startswith(machine), name
-            assert f"fmi{version}DoStep".encode() in content or name.endswith("darwin")  # whose names share prefixes
+            # Whose names share prefixes
+            assert f"fmi{version}DoStep".encode() in content or name.endswith("darwin")
     assert validate_fmu(path).problems == ()
 
 
@@ -209,10 +227,15 @@ def test_information_tells_version_platform_and_variables(version):
     assert information.has_sources
     assert list(information.interfaces) == ["co-simulation", "model exchange"]
     for capabilities in information.interfaces.values():
-        assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
+        assert {"cangetandsetfmustate", "canserializefmustate"} < {
+            name.lower() for name in capabilities
+        }
         assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
     assert len(described.modelVariables) == (203 if version == 2 else 39)
-    assert all(variable.unit and variable.description for variable in described.modelVariables) or version == 2
+    assert (
+        all(variable.unit and variable.description for variable in described.modelVariables)
+        or version == 2
+    )
 
 
 def problems_of(target: Path, name: str, old: bytes, new: bytes) -> tuple[str, ...]:
@@ -241,14 +264,18 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
         ExportOptions(1)
     with pytest.raises(ValueError, match="platforms must name at least one"):
         ExportOptions(2, platforms=())
-    with pytest.raises(ValueError, match=r"platforms holds 'amiga'; known are x86_64-linux.*and 'all'"):
+    with pytest.raises(
+        ValueError, match=r"platforms holds 'amiga'; known are x86_64-linux.*and 'all'"
+    ):
         parse_platforms("amiga")
     with pytest.raises(ValueError, match="fmi_version must be one of 2, 3, got 4"):
         Ur5FmuConfig(fmi_version=4)
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(compiling.shutil, "which", lambda _: None)
     monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(CompilerMissing, match=r"install gcc or clang.*zig with pip install 'servobench\[cross\]'"):
+    with pytest.raises(
+        CompilerMissing, match=r"install gcc or clang.*zig with pip install 'servobench\[cross\]'"
+    ):
         export_fmu(tmp_path / "ur5.fmu", ExportOptions(2))
     assert list(tmp_path.iterdir()) == []
     cached_fmu.cache_clear()
@@ -257,7 +284,9 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
         ENTRY.build(Ur5FmuConfig(), setup())
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(ValueError, match="FMU cannot be built: cache folder .* cannot be written: .*XDG_CACHE_HOME"):
+    with pytest.raises(
+        ValueError, match="FMU cannot be built: cache folder .* cannot be written: .*XDG_CACHE_HOME"
+    ):
         ENTRY.build(Ur5FmuConfig(), setup())
     cached_fmu.cache_clear()
 

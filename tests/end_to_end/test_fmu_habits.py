@@ -40,7 +40,17 @@ def fresh(tmp_path, monkeypatch):
 
 def run(monkeypatch, mapping, *options: str, duration: int = 1) -> int:
     place = str(mapping.with_name("out"))
-    words = ("run", "--plant", f"fmu:{mapping}", "--controller", "ukf_mfac", *TARGET, "--no-figures", "--out", place)
+    words = (
+        "run",
+        "--plant",
+        f"fmu:{mapping}",
+        "--controller",
+        "ukf_mfac",
+        *TARGET,
+        "--no-figures",
+        "--out",
+        place,
+    )
     words = (*words, "--set", f"target.duration={duration}")
     return servobench(monkeypatch, *words, *options)
 
@@ -80,7 +90,9 @@ def test_a_run_begins_at_the_start_time_of_the_experiment_or_of_the_mapping(
     world.advance(np.array([0.1, 0.0]))
     world.reset(0)
     np.testing.assert_allclose(world.see(), np.add(TIP, (0.0, before)), atol=1e-15)
-    assert ("stub.fmu begins at 10 s, the startTime of its default experiment" in caplog.text) == noted
+    assert (
+        "stub.fmu begins at 10 s, the startTime of its default experiment" in caplog.text
+    ) == noted
 
 
 def test_the_clock_of_an_fmu_goes_on_from_its_start_time(opened):
@@ -95,8 +107,16 @@ def test_the_clock_of_an_fmu_goes_on_from_its_start_time(opened):
 @pytest.mark.parametrize(
     ("text", "more", "message"),
     [
-        ("1e300", "", r"steps of 0.05 s from 1e\+300 s, the startTime of its default experiment: write"),
-        ("soon", "", "from nan s, the startTime of its default experiment: write start_time = 0.0 into the mapping"),
+        (
+            "1e300",
+            "",
+            r"steps of 0.05 s from 1e\+300 s, the startTime of its default experiment: write",
+        ),
+        (
+            "soon",
+            "",
+            "from nan s, the startTime of its default experiment: write start_time = 0.0 into the mapping",
+        ),
         ("INF", "", "from inf s, the startTime"),
         ("0", "start_time = 1e18\n", r"from 1e\+18 s, the start_time of the mapping"),
     ],
@@ -111,17 +131,26 @@ def test_a_start_time_in_which_steps_are_lost_is_refused(opened, text, more, mes
     [
         (("LOOKS_AFTER=0",), "y[1] (to 0.506 in step 1), y[2] (to 0.547 in step 1)"),
         (("LOOKS_AFTER=2",), "y[1] (to 0.506 in step 3), y[2] (to 0.547 in step 3)"),
-        (("LOOKS_AFTER=0", "HEIGHT=10*s->time"), "y[1] (to 0.506 in step 1)"),  # y[2] rises evenly from 0
+        (
+            ("LOOKS_AFTER=0", "HEIGHT=10*s->time"),
+            "y[1] (to 0.506 in step 1)",
+        ),  # y[2] rises evenly from 0
         ((), ""),
         (("HEIGHT=0",), ""),
         (("HEIGHT=s->time*s->time",), ""),
         (("HEIGHT=sin(s->time)",), ""),
     ],
 )
-def test_outputs_that_jump_from_exactly_0_in_the_first_steps_are_remarked_on(opened, caplog, macros, jumps):
+def test_outputs_that_jump_from_exactly_0_in_the_first_steps_are_remarked_on(
+    opened, caplog, macros, jumps
+):
     opened(*macros).rehearse()
-    lines = [line for line in caplog.messages if "returns 0 at the start for what then jumps" in line]
-    assert [f"rests: {jumps}; runs begin with a wrong measurement" in line for line in lines] == [True] * bool(jumps)
+    lines = [
+        line for line in caplog.messages if "returns 0 at the start for what then jumps" in line
+    ]
+    assert [f"rests: {jumps}; runs begin with a wrong measurement" in line for line in lines] == [
+        True
+    ] * bool(jumps)
 
 
 def test_the_command_line_remarks_on_late_outputs_and_runs_as_before(monkeypatch, tmp_path, caplog):
@@ -151,12 +180,16 @@ SIXTY, THIRTY = 1.0 / 60.0, 1.0 / 30.0
         (0.05, "0.0166667", "", 1),
     ],
 )
-def test_a_step_that_a_file_rounds_is_the_part_of_the_period_that_was_meant(opened, period, internal, more, steps):
+def test_a_step_that_a_file_rounds_is_the_part_of_the_period_that_was_meant(
+    opened, period, internal, more, steps
+):
     description = describe(interface=f'fixedInternalStepSize="{internal}"')
     world = opened(description=description, more=more, period=period)
     for _ in range(3):
         joints = world.advance(np.array([0.6, -0.6]))
-    np.testing.assert_allclose(joints, np.array([0.3, 1.2]) + 3 * period * np.array([0.6, -0.6]), rtol=1e-14)
+    np.testing.assert_allclose(
+        joints, np.array([0.3, 1.2]) + 3 * period * np.array([0.6, -0.6]), rtol=1e-14
+    )
     assert world._own_step * steps == pytest.approx(period, rel=1e-15)
 
 
@@ -164,25 +197,49 @@ def test_a_step_that_a_file_rounds_is_the_part_of_the_period_that_was_meant(open
     ("period", "internal", "more", "message"),
     [
         (SIXTY, "0.0167", "", "multiples of 0.0167 s only .* got 0.016666666666666666 s"),
-        (SIXTY, "0.01668", "period = 0.0166667\n", "multiples of 0.01668 s only .* got 0.016666666666666666 s"),
+        (
+            SIXTY,
+            "0.01668",
+            "period = 0.0166667\n",
+            "multiples of 0.01668 s only .* got 0.016666666666666666 s",
+        ),
         (THIRTY, "0.033", "", "multiples of 0.033 s only .* got 0.0333"),
         (0.05, "0.016668", "", "multiples of 0.016668 s only .* got 0.05 s"),
-        (0.05, "0.01", "period = 0.0124\n", "whole multiple of the plant's own step of 0.0124 s, got 0.05 s"),
+        (
+            0.05,
+            "0.01",
+            "period = 0.0124\n",
+            "whole multiple of the plant's own step of 0.0124 s, got 0.05 s",
+        ),
     ],
 )
-def test_a_step_that_is_no_rounded_part_of_the_period_is_refused_in_full(opened, period, internal, more, message):
+def test_a_step_that_is_no_rounded_part_of_the_period_is_refused_in_full(
+    opened, period, internal, more, message
+):
     with pytest.raises(ValueError, match=message):
-        opened(description=describe(interface=f'fixedInternalStepSize="{internal}"'), more=more, period=period)
+        opened(
+            description=describe(interface=f'fixedInternalStepSize="{internal}"'),
+            more=more,
+            period=period,
+        )
 
 
 @pytest.mark.parametrize(
     ("macros", "reason"),
     [
-        (("ENDS_EARLY=0.12",), "discard and not how far it came: the library in stub.fmu does not export fmi2GetReal"),
-        (("ENDS_EARLY=0.12", "HAS_STATUS"), "discard and not how far it came; the FMU said: step too long"),
+        (
+            ("ENDS_EARLY=0.12",),
+            "discard and not how far it came: the library in stub.fmu does not export fmi2GetReal",
+        ),
+        (
+            ("ENDS_EARLY=0.12", "HAS_STATUS"),
+            "discard and not how far it came; the FMU said: step too long",
+        ),
     ],
 )
-def test_a_step_that_an_fmu_discards_without_a_time_is_an_fmu_error_with_its_reason(opened, macros, reason):
+def test_a_step_that_an_fmu_discards_without_a_time_is_an_fmu_error_with_its_reason(
+    opened, macros, reason
+):
     world = opened(*macros)
     for _ in range(3):
         world.advance(np.zeros(2))
@@ -201,17 +258,27 @@ def test_functions_that_an_fmu_lacks_are_named_where_they_are_needed(opened):
         world.save()
 
 
-ENDS = ("AT_FREE=abort()", "AT_TERMINATE=exit(3)", "AT_UNLOAD=*(volatile int *)0=0", "AT_FREE=hang()")
+ENDS = (
+    "AT_FREE=abort()",
+    "AT_TERMINATE=exit(3)",
+    "AT_UNLOAD=*(volatile int *)0=0",
+    "AT_FREE=hang()",
+)
 
 
 @pytest.mark.parametrize("macro", ENDS)
-def test_a_run_that_ended_well_stays_whatever_its_library_does_at_the_end(monkeypatch, tmp_path, caplog, macro):
+def test_a_run_that_ended_well_stays_whatever_its_library_does_at_the_end(
+    monkeypatch, tmp_path, caplog, macro
+):
     monkeypatch.setattr("servobench.plant.fmu.release.RELEASE_TIME", 0.2)
     monkeypatch.setenv("STUB_MAY_FALL", "1")
     context = multiprocessing.get_context("fork")  # as that of a runner
     ours, theirs = context.Pipe()
     request = RunRequest(f"fmu:{build_stub(tmp_path, macro)}", "ukf_mfac", "target", Mismatch(), 0)
-    settings = {"target": {"target": [0.1, 0.75], "duration": 0.2}, "ukf_mfac": {"initial": {"source": "probe"}}}
+    settings = {
+        "target": {"target": [0.1, 0.75], "duration": 0.2},
+        "ukf_mfac": {"initial": {"source": "probe"}},
+    }
     job = Job(0, Cell(request), resolve(request, Settings(settings)))
     task = ((), pickle.dumps((Block((job,)), False, None)))
     process = context.Process(target=_carry_out_there, args=(task, theirs.send))
@@ -225,7 +292,12 @@ def test_a_run_that_ended_well_stays_whatever_its_library_does_at_the_end(monkey
 
 def test_a_crash_costs_no_other_run_and_names_its_instant(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("STUB_MAY_FALL", "1")
-    late = ("--set", "ukf_mfac.initial.source=given", "--set", "ukf_mfac.initial.given=[[0, 1], [1, 0]]")
+    late = (
+        "--set",
+        "ukf_mfac.initial.source=given",
+        "--set",
+        "ukf_mfac.initial.given=[[0, 1], [1, 0]]",
+    )
     mapping = build_stub(tmp_path, "AT_UNLOAD=abort()", "FALLS_AFTER=0.42")
     assert run(monkeypatch, mapping, *PROBES[:2], *PROBES[4:], *late) == 1
     (row,) = results.load_runs(tmp_path / "out").to_dict("records")
@@ -241,13 +313,17 @@ def test_an_archive_with_any_separator_and_letters_runs(opened, separator, name)
 
 
 @pytest.mark.parametrize("folder", ["with blank", "ü", "100 %", "a#b?c", "plain"])
-def test_an_fmu_that_does_not_decode_its_uri_finds_its_resources(opened, tmp_path, monkeypatch, folder):
+def test_an_fmu_that_does_not_decode_its_uri_finds_its_resources(
+    opened, tmp_path, monkeypatch, folder
+):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / folder))
     world = opened('OPENS="gain.txt"', files=("gain.txt",))
     np.testing.assert_allclose(world.see(), TIP, atol=1e-15)
 
 
-def test_a_plant_without_a_model_settles_without_further_settings_and_says_so(monkeypatch, tmp_path, caplog):
+def test_a_plant_without_a_model_settles_without_further_settings_and_says_so(
+    monkeypatch, tmp_path, caplog
+):
     mapping = build_stub(tmp_path)
     assert run(monkeypatch, mapping, duration=6) == 0
     (row,) = results.load_runs(tmp_path / "out").to_dict("records")
@@ -259,14 +335,19 @@ def test_a_plant_without_a_model_settles_without_further_settings_and_says_so(mo
 def test_settings_of_a_user_and_plants_with_a_model_stay_as_they_are(tmp_path, caplog):
     plant = f"fmu:{build_stub(tmp_path)}"
     given = {"ukf_mfac": {"initial": {"source": "probe"}}}
-    controller = resolve(RunRequest(plant, "ukf_mfac", "target", Mismatch(), 0), Settings(given)).controller
+    controller = resolve(
+        RunRequest(plant, "ukf_mfac", "target", Mismatch(), 0), Settings(given)
+    ).controller
     assert controller.aids.posture
     mixed = [RunRequest(each, "ukf_mfac", "target", Mismatch(), 0) for each in (plant, "kinematic")]
     assert resolve_sections(mixed, Settings({}))["ukf_mfac"].initial.source == "nominal"
     assert "has no model" not in caplog.text
     batch = Batch((plant, "kinematic"), ("ukf_mfac",), ("target",), ("moderate",), (0,))
     assert [str(request.mismatch) for request in batch.requests()] == ["none", "moderate"]
-    assert "stub.toml has a robot of its own: the mismatch moderate stands for none there" in caplog.text
+    assert (
+        "stub.toml has a robot of its own: the mismatch moderate stands for none there"
+        in caplog.text
+    )
 
 
 class Calls(Controller):
@@ -310,22 +391,51 @@ def test_an_exported_arm_needs_no_mapping(tmp_path):
     assert plant.truth().jacobian.shape == (3, 6)
     plant.close()
     build_stub(tmp_path)
-    with pytest.raises(ValueError, match="stub.fmu has not the names of an exported arm: write a mapping, a TOML"):
+    with pytest.raises(
+        ValueError, match="stub.fmu has not the names of an exported arm: write a mapping, a TOML"
+    ):
         find_plant(f"fmu:{tmp_path / 'stub.fmu'}")
 
 
 @pytest.mark.parametrize(
     ("more", "problem"),
     [
-        ('<DefaultExperiment startTime="1e300"/>', r"startTime .* must be within 1e\+12 s, got 1e\+300"),
-        ('<DefaultExperiment stopTime="-1"/>', "stopTime .* must be later than startTime, 0, got -1"),
-        ('<DefaultExperiment startTime="5" stopTime="5"/>', "stopTime .* must be later than startTime, 5, got 5"),
-        ('<DefaultExperiment stepSize="0"/>', "stepSize of the default experiment must be above 0, got 0"),
-        ('<DefaultExperiment stepSize="fast"/>', "stepSize of the default experiment must be above 0, got nan"),
-        ('<DefaultExperiment tolerance="-1"/>', "tolerance of the default experiment must be above 0, got -1"),
-        ('<ModelExchange modelIdentifier="../stub"/>', "modelIdentifier of model exchange must .* got '../stub'"),
-        ('<ScheduledExecution modelIdentifier="a/b"/>', "modelIdentifier of scheduled execution must .* got 'a/b'"),
-        ('<DefaultExperiment startTime="-5" stopTime="-1" stepSize="1e-3" tolerance="1e-6"/>', None),
+        (
+            '<DefaultExperiment startTime="1e300"/>',
+            r"startTime .* must be within 1e\+12 s, got 1e\+300",
+        ),
+        (
+            '<DefaultExperiment stopTime="-1"/>',
+            "stopTime .* must be later than startTime, 0, got -1",
+        ),
+        (
+            '<DefaultExperiment startTime="5" stopTime="5"/>',
+            "stopTime .* must be later than startTime, 5, got 5",
+        ),
+        (
+            '<DefaultExperiment stepSize="0"/>',
+            "stepSize of the default experiment must be above 0, got 0",
+        ),
+        (
+            '<DefaultExperiment stepSize="fast"/>',
+            "stepSize of the default experiment must be above 0, got nan",
+        ),
+        (
+            '<DefaultExperiment tolerance="-1"/>',
+            "tolerance of the default experiment must be above 0, got -1",
+        ),
+        (
+            '<ModelExchange modelIdentifier="../stub"/>',
+            "modelIdentifier of model exchange must .* got '../stub'",
+        ),
+        (
+            '<ScheduledExecution modelIdentifier="a/b"/>',
+            "modelIdentifier of scheduled execution must .* got 'a/b'",
+        ),
+        (
+            '<DefaultExperiment startTime="-5" stopTime="-1" stepSize="1e-3" tolerance="1e-6"/>',
+            None,
+        ),
         ("", None),
     ],
 )
@@ -339,7 +449,10 @@ def test_what_breaks_the_standard_and_runs_is_no_problem(output_of, tmp_path):
     text = describe().replace("<Outputs>", "<!--").replace("</Outputs>", "-->")
     build_stub(tmp_path, description=text, files=("\x1b[2Jx",))
     printed = output_of("fmu", "validate", tmp_path / "stub.fmu", code=1)
-    assert "problem: the name of a file must have printable letters, got 'resources/\\x1b[2Jx'" in printed
+    assert (
+        "problem: the name of a file must have printable letters, got 'resources/\\x1b[2Jx'"
+        in printed
+    )
     assert "breaks the standard here: ModelStructure" in printed
     build_stub(tmp_path, description=text)
     printed = output_of("fmu", "validate", tmp_path / "stub.fmu")

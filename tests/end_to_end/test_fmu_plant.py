@@ -27,7 +27,10 @@ from servobench.plant.robot.ur5 import HOME
 QUIET = FmuConfig(0.0, SensingConfig(0.0))
 START = np.array([0.3, 1.2])
 PERIOD = 0.05
-ARMS = {2: 'parameters = {"arm.slew" = 0.6, "arm.luff" = 0.3}\n', 3: "parameters = {arm = [0.6, 0.3]}\n"}
+ARMS = {
+    2: 'parameters = {"arm.slew" = 0.6, "arm.luff" = 0.3}\n',
+    3: "parameters = {arm = [0.6, 0.3]}\n",
+}
 TOML = """
 period = 0.01
 limits = {max_joint_speed = 2.0}
@@ -45,7 +48,9 @@ def cache(tmp_path, monkeypatch) -> Path:
 def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> Bench:
     path = build_crane(tmp_path / "crane.fmu", version)
     arguments = {"file": path, "limits": JointLimits(2.0), **ROLES[version], **changes}
-    plant = Bench(FmuWorld(FmuMapping(**arguments), START, PERIOD), config.command_delay, config.sensing)
+    plant = Bench(
+        FmuWorld(FmuMapping(**arguments), START, PERIOD), config.command_delay, config.sensing
+    )
     plant.reset(0)
     return plant
 
@@ -67,7 +72,10 @@ def test_a_loop_closes_on_a_foreign_fmu_through_a_mapping_alone(tmp_path, versio
     np.testing.assert_allclose(observation.feature, place_of(START, (0.6, 0.3)), atol=1e-15)
     for _ in range(120):
         q = observation.joint_position
-        columns = [(place_of(q + d, (0.6, 0.3)) - place_of(q - d, (0.6, 0.3))) / 2e-6 for d in 1e-6 * np.eye(2)]
+        columns = [
+            (place_of(q + d, (0.6, 0.3)) - place_of(q - d, (0.6, 0.3))) / 2e-6
+            for d in 1e-6 * np.eye(2)
+        ]
         u = 2.0 * np.linalg.solve(np.column_stack(columns), target - observation.feature)
         observation = plant.step(Command(u))
     assert np.linalg.norm(observation.feature - target) < 1e-4
@@ -81,7 +89,9 @@ def test_commands_are_clipped_delayed_and_held_over_the_fmus_own_steps(tmp_path,
     plant.reset(0)
     assert plant.step(Command([9.0, -1.0])).joint_position.tolist() == START.tolist()
     observation = plant.step(Command([0.0, 0.0]))
-    np.testing.assert_allclose(observation.joint_position, START + PERIOD * np.array([2.0, -1.0]), atol=1e-14)
+    np.testing.assert_allclose(
+        observation.joint_position, START + PERIOD * np.array([2.0, -1.0]), atol=1e-14
+    )
     assert observation.time == 2 * PERIOD
     plant.close()
 
@@ -90,7 +100,9 @@ def test_without_joints_the_commands_are_integrated(tmp_path):
     plant = crane(tmp_path, 2, joints=())
     for _ in range(3):
         observation = plant.step(Command([1.0, -3.0]))
-    np.testing.assert_allclose(observation.joint_position, START + 3 * PERIOD * np.array([1.0, -2.0]), atol=1e-14)
+    np.testing.assert_allclose(
+        observation.joint_position, START + 3 * PERIOD * np.array([1.0, -2.0]), atol=1e-14
+    )
     plant.close()
 
 
@@ -100,7 +112,9 @@ def test_a_step_that_ends_early_is_taken_up_where_it_ended_however_often(tmp_pat
     plant = crane(tmp_path, version, parameters={"quirk": np.array(quirk)})
     for k in (1, 2):
         observation = plant.step(Command([1.0, 0.5]))
-        np.testing.assert_allclose(observation.joint_position, START + k * PERIOD * np.array([1.0, 0.5]), atol=1e-12)
+        np.testing.assert_allclose(
+            observation.joint_position, START + k * PERIOD * np.array([1.0, 0.5]), atol=1e-12
+        )
     plant.close()
 
 
@@ -128,24 +142,37 @@ def test_a_failed_step_is_an_fmu_error_with_the_fmus_last_message(tmp_path, vers
 )
 def test_misbehaviour_at_run_time_is_an_fmu_error(tmp_path, version, quirk, message):
     with pytest.raises(FmuError, match=message):
-        crane(tmp_path, version, parameters={"quirk": np.array(float(quirk))}).step(Command([0.0, 0.0]))
+        crane(tmp_path, version, parameters={"quirk": np.array(float(quirk))}).step(
+            Command([0.0, 0.0])
+        )
 
 
-@pytest.mark.parametrize(("quirk", "message"), [(1.0, "DoStep returned error"), (7.0, "not finite for place")])
+@pytest.mark.parametrize(
+    ("quirk", "message"), [(1.0, "DoStep returned error"), (7.0, "not finite for place")]
+)
 @pytest.mark.parametrize("version", [2, 3])
 def test_an_instance_that_fails_does_not_disturb_those_beside_it(tmp_path, version, quirk, message):
-    starts, commands = np.array([[0.3, 1.2], [0.1, 0.9], [-0.4, 1.5]]), np.random.default_rng(0).normal(size=(9, 3, 2))
+    starts, commands = (
+        np.array([[0.3, 1.2], [0.1, 0.9], [-0.4, 1.5]]),
+        np.random.default_rng(0).normal(size=(9, 3, 2)),
+    )
     path = build_crane(tmp_path / "crane.fmu", version)
 
     def seen_alone(lane):
-        plant = Bench(FmuWorld(FmuMapping(path, **ROLES[version]), starts[lane], PERIOD), 0, SensingConfig(0.0))
+        plant = Bench(
+            FmuWorld(FmuMapping(path, **ROLES[version]), starts[lane], PERIOD),
+            0,
+            SensingConfig(0.0),
+        )
         plant.reset(0)
         seen = [plant.step(Command(u)) for u in commands[:, lane]]
         plant.close()
         return [(each.joint_position.tobytes(), each.feature.tobytes()) for each in seen]
 
     alone = [seen_alone(lane) for lane in range(3)]
-    crane_mapping = FmuMapping(path, **ROLES[version], parameters={"quirk": np.array([[0.0], [quirk], [0.0]])})
+    crane_mapping = FmuMapping(
+        path, **ROLES[version], parameters={"quirk": np.array([[0.0], [quirk], [0.0]])}
+    )
     plant = Bench(FmuWorld(crane_mapping, starts, PERIOD), 0, SensingConfig(0.0))
     plant.reset([0, 0, 0])
     lanes = np.arange(3)
@@ -154,7 +181,10 @@ def test_an_instance_that_fails_does_not_disturb_those_beside_it(tmp_path, versi
         assert np.isfinite(seen.feature).all()
         for place, lane in enumerate(lanes):
             if place not in plant.faults:
-                assert (seen.joint_position[place].tobytes(), seen.feature[place].tobytes()) == alone[lane][k]
+                assert (
+                    seen.joint_position[place].tobytes(),
+                    seen.feature[place].tobytes(),
+                ) == alone[lane][k]
         if plant.faults and k > 6:  # it rests for a while before it is dropped
             (fault,) = plant.faults.values()
             assert (list(plant.faults), message in str(fault)) == ([1], True)
@@ -169,12 +199,21 @@ def test_an_instance_that_fails_does_not_disturb_those_beside_it(tmp_path, versi
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"inputs": ("pusch.slew", "push.luff")}, r"inputs names 'pusch.slew'.*did you mean 'push.slew'.*wheel.slew"),
+        (
+            {"inputs": ("pusch.slew", "push.luff")},
+            r"inputs names 'pusch.slew'.*did you mean 'push.slew'.*wheel.slew",
+        ),
         ({"inputs": ("place.slew", "place.luff")}, "causality output"),
-        ({"joints": ("wheel.slew",)}, "joints must name 2 numbers for 2 inputs and 2 features, got 1"),
+        (
+            {"joints": ("wheel.slew",)},
+            "joints must name 2 numbers for 2 inputs and 2 features, got 1",
+        ),
         ({"truth": TruthMapping(jacobian=("arm.slew",))}, "truth.jacobian must name 4 numbers"),
         ({"home": "gear"}, "type Integer; wanted a real variable"),
-        ({"parameters": {"arm.slew": np.array([1.0, 2.0])}}, "parameter 'arm.slew' must have 1 values, got 2"),
+        (
+            {"parameters": {"arm.slew": np.array([1.0, 2.0])}},
+            "parameter 'arm.slew' must have 1 values, got 2",
+        ),
         ({"names": LogNames(("slew",))}, "names.joints must hold 2 names, got 1"),
         ({"period": 0.03}, "whole multiple of the plant's own step of 0.03 s"),
         ({"inputs": ()}, "inputs must be of length 1 or more"),
@@ -217,7 +256,9 @@ def test_a_closed_plant_may_be_closed_again_but_not_stepped(tmp_path):
         plant.step(Command([0.0, 0.0]))
 
 
-@pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil.txt", "a\\..\\evil.txt", "c:evil.txt", "a/../../evil.txt"])
+@pytest.mark.parametrize(
+    "name", ["../evil.txt", "/etc/evil.txt", "a\\..\\evil.txt", "c:evil.txt", "a/../../evil.txt"]
+)
 def test_an_archive_that_climbs_out_of_its_folder_is_refused(tmp_path, name):
     path = tmp_path / "evil.fmu"
     with zipfile.ZipFile(path, "w") as archive:
@@ -294,7 +335,9 @@ def counts(path: Path, version: int) -> tuple[int, int]:
     """Return how often the crane was terminated, and how often it was called after a fatal error."""
     folder = extract_fmu(path) / "binaries" / this_platform().folder(version)
     library = ctypes.CDLL(str(folder / f"crane{this_platform().suffix}"))
-    return tuple(ctypes.c_int.in_dll(library, name).value for name in ("terminated", "called_after_fatal"))
+    return tuple(
+        ctypes.c_int.in_dll(library, name).value for name in ("terminated", "called_after_fatal")
+    )
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -314,7 +357,8 @@ def test_an_fmu_is_terminated_before_it_is_freed(tmp_path, version):
 @pytest.mark.parametrize("version", [2, 3])
 def test_nothing_of_an_fmu_is_called_after_a_fatal_error(tmp_path, version):
     path = build_crane(tmp_path / "crane.fmu", version)
-    quirks = np.array([[0.0], [0.0], [9.0]])  # those beside it in a period are called before that is known
+    # Those beside it in a period are called before that is known
+    quirks = np.array([[0.0], [0.0], [9.0]])
     crane_mapping = FmuMapping(path, **ROLES[version], parameters={"quirk": quirks})
     world = FmuWorld(crane_mapping, np.tile(START, (3, 1)), PERIOD)
     world.advance(np.zeros((3, 2)))

@@ -55,10 +55,14 @@ def write(exported, folder):
 
 def tidy(file, *, generated=False):
     checks = [f"--checks={CASADI}"] if generated else []
-    return carried_out("clang-tidy", "--quiet", f"--config-file={CONFIGURATION}", *checks, file, "--", "-std=c11")
+    return carried_out(
+        "clang-tidy", "--quiet", f"--config-file={CONFIGURATION}", *checks, file, "--", "-std=c11"
+    )
 
 
-NEEDS_SANITIZERS = pytest.mark.skipif(not can_sanitize(), reason="needs a C compiler with sanitizers")
+NEEDS_SANITIZERS = pytest.mark.skipif(
+    not can_sanitize(), reason="needs a C compiler with sanitizers"
+)
 
 
 @NEEDS_SANITIZERS

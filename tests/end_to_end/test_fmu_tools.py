@@ -35,7 +35,8 @@ PERIOD = 0.05
 STEPS = 1000
 MISMATCHES = ["none", "severe"]
 OFFSETS = arm_layout(6).offsets
-COMMANDS = np.random.default_rng(1).uniform(-1.3, 1.3, (STEPS, 6))  # some beyond the limit of 1 rad/s
+# Some beyond the limit of 1 rad/s
+COMMANDS = np.random.default_rng(1).uniform(-1.3, 1.3, (STEPS, 6))
 COMMANDS.setflags(write=False)
 
 
@@ -44,7 +45,10 @@ def simulated(mismatch: str, commands) -> np.ndarray:
     config = configure(KinematicConfig, feature_noise=0.0, command_delay=0.0)
     plant = build_kinematic(config, PlantSetup(mismatched(mismatch), np.array(HOME), PERIOD))
     plant.reset(0)
-    rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in commands]
+    rows = [
+        np.r_[plant.step(Command(command)).joint_position, plant.truth().feature]
+        for command in commands
+    ]
     return np.array(rows)
 
 
@@ -73,9 +77,14 @@ def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch)
     time = np.arange(STEPS) * PERIOD
     if version == 2:
         names = [f"joint_velocity_command[{i + 1}]" for i in range(6)]
-        signal = np.array([tuple(row) for row in np.c_[time, COMMANDS]], dtype=[(n, float) for n in ["time", *names]])
+        signal = np.array(
+            [tuple(row) for row in np.c_[time, COMMANDS]],
+            dtype=[(n, float) for n in ["time", *names]],
+        )
         start = scalars(mismatch)
-        outputs = [f"joint_position[{i + 1}]" for i in range(6)] + [f"ball_position[{i + 1}]" for i in range(3)]
+        outputs = [f"joint_position[{i + 1}]" for i in range(6)] + [
+            f"ball_position[{i + 1}]" for i in range(3)
+        ]
     else:
         signal = np.zeros(STEPS, dtype=[("time", float), ("joint_velocity_command", float, (6,))])
         signal["time"], signal["joint_velocity_command"] = time, COMMANDS
@@ -91,7 +100,9 @@ def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch)
 
 FMUSIM = os.environ.get("FMUSIM") or shutil.which("fmusim")
 CHECKER = os.environ.get("FMUCHECK") or shutil.which("fmuCheck.linux64")
-NEEDS_FMUSIM = pytest.mark.skipif(FMUSIM is None, reason="fmusim is not installed; FMUSIM=PATH names it")
+NEEDS_FMUSIM = pytest.mark.skipif(
+    FMUSIM is None, reason="fmusim is not installed; FMUSIM=PATH names it"
+)
 JOINTS = [f"[{i + 1}]" for i in range(6)]
 
 
@@ -99,18 +110,42 @@ def by_fmusim(version: int, kind: str, commands, folder) -> np.ndarray:
     """Return joint positions and features after each step, (k, 9), as fmusim computes them."""
     time, stop = np.arange(len(commands)) * PERIOD, len(commands) * PERIOD
     if version == 2:
-        outputs = [*(f"joint_position{each}" for each in JOINTS), *(f"ball_position[{i + 1}]" for i in range(3))]
+        outputs = [
+            *(f"joint_position{each}" for each in JOINTS),
+            *(f"ball_position[{i + 1}]" for i in range(3)),
+        ]
         inputs = {f"joint_velocity_command{each}": commands[:, i] for i, each in enumerate(JOINTS)}
     else:
         outputs = ["joint_position", "ball_position"]
         inputs = {"joint_velocity_command": [" ".join(map(repr, row)) for row in commands.tolist()]}
     pd.DataFrame({"time": time, **inputs}).to_csv(folder / "in.csv", index=False)
     wanted = [word for name in outputs for word in ("--output-variable", name)]
-    times = ["--stop-time", str(stop), "--output-interval", str(PERIOD), "--tolerance", "1e-8", "--solver", "cvode"]
-    files = ["--input-file", folder / "in.csv", "--output-file", folder / "out.csv", cached_fmu(version)]
+    times = [
+        "--stop-time",
+        str(stop),
+        "--output-interval",
+        str(PERIOD),
+        "--tolerance",
+        "1e-8",
+        "--solver",
+        "cvode",
+    ]
+    files = [
+        "--input-file",
+        folder / "in.csv",
+        "--output-file",
+        folder / "out.csv",
+        cached_fmu(version),
+    ]
     done = carried_out(FMUSIM, "--interface-type", kind, *times, *wanted, *files)
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = (folder / "out.csv").read_text(encoding="utf-8").replace('"', "").replace(",", " ").splitlines()[1:]
+    rows = (
+        (folder / "out.csv")
+        .read_text(encoding="utf-8")
+        .replace('"', "")
+        .replace(",", " ")
+        .splitlines()[1:]
+    )
     came = np.array([[float(word) for word in row.split()] for row in rows])
     np.testing.assert_allclose(came[1:, 0], time + PERIOD, atol=1e-9)
     return came[1:, 1:]
@@ -119,19 +154,24 @@ def by_fmusim(version: int, kind: str, commands, folder) -> np.ndarray:
 @NEEDS_FMUSIM
 @pytest.mark.parametrize("version", [2, 3])
 def test_fmusim_runs_it_and_agrees_over_a_thousand_random_steps(version, tmp_path):
-    np.testing.assert_allclose(by_fmusim(version, "cs", COMMANDS, tmp_path), oracle("none"), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        by_fmusim(version, "cs", COMMANDS, tmp_path), oracle("none"), rtol=0, atol=1e-9
+    )
 
 
 @NEEDS_FMUSIM
 @pytest.mark.parametrize("version", [2, 3])
 def test_fmusim_integrates_its_model_exchange_side_and_agrees(version, tmp_path):
-    held = np.tile(COMMANDS[0] / 3.0, (40, 1))  # as its solver is not restarted at a jump of an input
+    # As its solver is not restarted at a jump of an input
+    held = np.tile(COMMANDS[0] / 3.0, (40, 1))
     exact = simulated("none", held)
     np.testing.assert_allclose(by_fmusim(version, "me", held, tmp_path), exact, rtol=0, atol=1e-6)
     assert np.ptp(exact, axis=0).max() > 0.1
 
 
-@pytest.mark.skipif(CHECKER is None, reason="the compliance checker is not installed; FMUCHECK=PATH names it")
+@pytest.mark.skipif(
+    CHECKER is None, reason="the compliance checker is not installed; FMUCHECK=PATH names it"
+)
 @pytest.mark.parametrize("kind", ["cs", "me"])
 def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
     names = ["time", *(f"joint_velocity_command{each}" for each in JOINTS)]
@@ -140,7 +180,9 @@ def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
     (tmp_path / "in.csv").write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
     step = PERIOD if kind == "cs" else PERIOD / 1000  # it integrates by Euler's method
     times = ["-s", "1", "-n", "20", "-h", str(step), "-l", "4", "-k", kind]
-    done = carried_out(CHECKER, *times, "-i", tmp_path / "in.csv", "-o", tmp_path / "out.csv", cached_fmu(2))
+    done = carried_out(
+        CHECKER, *times, "-i", tmp_path / "in.csv", "-o", tmp_path / "out.csv", cached_fmu(2)
+    )
     assert done.returncode == 0, done.stderr
     for line in ("0 warning(s) and error(s)", "0 Warning(s)", "0 Error(s)"):
         assert f"\t{line}" in done.stderr
@@ -152,10 +194,16 @@ def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
 
 @pytest.mark.parametrize(
     "loop",
-    [Loop("ukf_mfac:published"), Loop("regression_mfac", "ur10e"), Loop("ukf_mfac:published", sensing="pixel")],
+    [
+        Loop("ukf_mfac:published"),
+        Loop("regression_mfac", "ur10e"),
+        Loop("ukf_mfac:published", sensing="pixel"),
+    ],
     ids=" ".join,
 )
-def test_fmpy_runs_a_system_of_plant_and_controller_as_the_harness_runs_the_loop(loop, tmp_path, monkeypatch):
+def test_fmpy_runs_a_system_of_plant_and_controller_as_the_harness_runs_the_loop(
+    loop, tmp_path, monkeypatch
+):
     """All methods and more arms: `python -m night.system_loops`, a part of `make nightly`."""
     if loop == Loop("ukf_mfac:published"):  # optimised, as users have it
         monkeypatch.delenv("CC", raising=False)
@@ -165,7 +213,11 @@ def test_fmpy_runs_a_system_of_plant_and_controller_as_the_harness_runs_the_loop
     assert not agree(loop, found + 1e-6 * np.abs(wanted).max(), wanted)
     read_ssd(str(path))  # checks it against the schema
     with zipfile.ZipFile(path) as archive:
-        assert archive.namelist() == ["SystemStructure.ssd", "resources/controller.fmu", "resources/plant.fmu"]
+        assert archive.namelist() == [
+            "SystemStructure.ssd",
+            "resources/controller.fmu",
+            "resources/plant.fmu",
+        ]
         text = archive.read("SystemStructure.ssd").decode()
     assert text.count("<ssd:Connection ") == 12 + 2 * (wanted.shape[1] - 6)  # of joints, features
 
@@ -193,7 +245,9 @@ Path(sys.argv[2]).write_text(json.dumps(rows))
 """
 
 
-@pytest.mark.skipif(importlib.util.find_spec("libcosimpy") is None, reason="libcosimpy is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("libcosimpy") is None, reason="libcosimpy is not installed"
+)
 @pytest.mark.parametrize("mismatch", MISMATCHES)
 def test_libcosimpy_runs_it_and_agrees_over_a_thousand_random_steps(mismatch, tmp_path):
     task, result = tmp_path / "task.json", tmp_path / "result.json"
@@ -209,8 +263,14 @@ def test_libcosimpy_runs_it_and_agrees_over_a_thousand_random_steps(mismatch, tm
             for i, value in enumerate(values.tolist())
         ],
     }
-    content = {"fmu": str(cached_fmu(2)), "nanoseconds": round(PERIOD * 1e9), "commands": COMMANDS.tolist()}
-    task.write_text(json.dumps(content | {name: list(values) for name, values in references.items()}))
+    content = {
+        "fmu": str(cached_fmu(2)),
+        "nanoseconds": round(PERIOD * 1e9),
+        "commands": COMMANDS.tolist(),
+    }
+    task.write_text(
+        json.dumps(content | {name: list(values) for name, values in references.items()})
+    )
     # In a process of its own: its C++ writes to the standard output and ends the process on what it does not like.
     done = carried_out(sys.executable, "-c", COSIM, task, result)
     assert done.returncode == 0, done.stderr

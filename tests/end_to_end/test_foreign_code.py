@@ -33,10 +33,15 @@ def mapping(tmp_path) -> Path:
     (tmp_path / "aborts.c").write_text(ABORTS)
     library = tmp_path / "aborts.so"
     compiler = shutil.which("cc") or "gcc"
-    subprocess.run([compiler, "-shared", "-fPIC", str(tmp_path / "aborts.c"), "-o", str(library)], check=True)
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", str(tmp_path / "aborts.c"), "-o", str(library)], check=True
+    )
     with zipfile.ZipFile(tmp_path / "crane.fmu", "w") as archive:
         archive.writestr("modelDescription.xml", describe(2))
-        archive.writestr(f"binaries/{this_platform().folder(2)}/crane{this_platform().suffix}", library.read_bytes())
+        archive.writestr(
+            f"binaries/{this_platform().folder(2)}/crane{this_platform().suffix}",
+            library.read_bytes(),
+        )
         archive.writestr(INPUT_FILE, "time,push.slew,push.luff\n0,0,0\n0.05,0,0\n")
         archive.writestr(OUTPUT_FILE, "time,wheel.slew,wheel.luff\n0,0.5,0.4\n0.05,0.5,0.4\n")
     return write(tmp_path, foreign_fmu.mapping(2), "crane.toml")
@@ -46,7 +51,10 @@ def test_an_fmu_that_ends_its_process_ends_no_command(output_of, mapping, monkey
     file = str(mapping.with_name("crane.fmu"))
     assert "wheel.slew" in output_of("fmu", "info", file)
     printed = output_of("fmu", "validate", file, code=1)
-    assert "the reference run ended: the run killed the process that carried it out: SIGABRT" in printed
+    assert (
+        "the reference run ended: the run killed the process that carried it out: SIGABRT"
+        in printed
+    )
     out = mapping.with_name("out")
     plants = ("--plants", f"fmu:{mapping}", "--workers", "1", "--out", str(out))
     assert servobench(monkeypatch, "sweep", *plants, *RUN) == 0
@@ -64,6 +72,15 @@ def test_an_fmu_that_the_user_trusts_shares_a_process(tmp_path, monkeypatch):
         run = resolve(RunRequest(plant, "broyden", "target", "none", 0), settings)
         assert bool(Job(0, Cell(run.request), run).owner) != trusted
     monkeypatch.setattr("servobench.harness.batch.blocks.Pool", None)  # no process can be started
-    arguments = ("--plants", plant, "--workers", "1", "--out", str(tmp_path / "out"), "--set", f"{plant}.isolate=false")
+    arguments = (
+        "--plants",
+        plant,
+        "--workers",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+        "--set",
+        f"{plant}.isolate=false",
+    )
     assert servobench(monkeypatch, "sweep", *arguments, *RUN) == 0
     assert set(results.load_runs(tmp_path / "out")["status"]) == {"completed"}

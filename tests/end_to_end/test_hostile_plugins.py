@@ -56,14 +56,26 @@ def place(words: str, function: str) -> str:
 
 
 REASONS = {
-    "exit": ("crashed", "the run killed the process that carried it out: exit code 9, in the period from 0 s on"),
+    "exit": (
+        "crashed",
+        "the run killed the process that carried it out: exit code 9, in the period from 0 s on",
+    ),
     "build": ("crashed", f"RuntimeError: no licence {place('no licence', 'build')}"),
     "close": ("crashed", f"RuntimeError: the window is gone {place('the window is gone', 'fail')}"),
     "hang": ("timed_out", "the run took longer than 8 s"),
 }
 LINES = {"build": 2, "close": 2, "hang": 1}  # of the trace of a run that name the plug-in
 COMMANDS = {
-    "compare": ("--no-figures", "--no-report", "--tasks", "random", "--seeds", "4", "--set", "random.duration=1"),
+    "compare": (
+        "--no-figures",
+        "--no-report",
+        "--tasks",
+        "random",
+        "--seeds",
+        "4",
+        "--set",
+        "random.duration=1",
+    ),
     "sweep": ("--seeds", "4", "--set", "random.duration=1"),
     "tune": ("--robots", "1", "--studies", "1", "--trials", "1", "--search", "0"),
 }
@@ -72,18 +84,37 @@ COMMANDS = {
 @pytest.fixture
 def plugin(tmp_path) -> Path:
     """A third party's plant, installed as far as Python can tell."""
-    return install(tmp_path / "site", "hostile", HOSTILE, "[servobench.plants]\nhostile = hostile:ENTRY\n")
+    return install(
+        tmp_path / "site", "hostile", HOSTILE, "[servobench.plants]\nhostile = hostile:ENTRY\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("command", "how", "workers"),
-    [("compare", "exit", "1"), ("sweep", "build", "1"), ("sweep", "close", "1"), ("tune", "hang", "2")],
+    [
+        ("compare", "exit", "1"),
+        ("sweep", "build", "1"),
+        ("sweep", "close", "1"),
+        ("tune", "hang", "2"),
+    ],
 )
-def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how, workers):
+def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(
+    plugin, tmp_path, command, how, workers
+):
     out = tmp_path / "out"
-    arguments = ("--plants", "hostile", "--controllers", "constant", "--workers", workers, *COMMANDS[command])
+    arguments = (
+        "--plants",
+        "hostile",
+        "--controllers",
+        "constant",
+        "--workers",
+        workers,
+        *COMMANDS[command],
+    )
     limit = ("--run-timeout", "3" if command == "tune" else "8") if how == "hang" else ()
-    code, output = finish(start(command, *arguments, *limit, "--out", str(out), path=plugin, HOSTILE=how))
+    code, output = finish(
+        start(command, *arguments, *limit, "--out", str(out), path=plugin, HOSTILE=how)
+    )
     assert code == 0, output
     assert "Traceback" not in output
     if command == "tune":
@@ -97,5 +128,7 @@ def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_pa
     assert set(zip(failed["status"], failed["reason"], strict=True)) == {REASONS[how]}
     assert not (out / results.PARTS).exists()
     log = (out / results.FAILURES).read_text()
-    assert [line.split(":")[0] for line in log.splitlines() if line.startswith("hostile-")] == failed["run_id"].tolist()
+    assert [
+        line.split(":")[0] for line in log.splitlines() if line.startswith("hostile-")
+    ] == failed["run_id"].tolist()
     assert log.count("hostile.py") == LINES.get(how, 0) * len(failed)

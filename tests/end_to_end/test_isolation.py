@@ -62,7 +62,9 @@ def swept(tmp_path_factory) -> pd.DataFrame:
     names = (FALSE_WORLD, *WANTED)
     arguments = ("--controllers", places(*names), "--workers", "1", *SHORT, *LIMITS)
     forged = out.with_name("forged")
-    code, output = finish(start("sweep", *arguments, "--out", str(out), **{MARK: mark, "FORGED": str(forged)}))
+    code, output = finish(
+        start("sweep", *arguments, "--out", str(out), **{MARK: mark, "FORGED": str(forged)})
+    )
     assert code == 0, output
     assert not forged.exists()
     assert "Traceback" not in output
@@ -103,17 +105,43 @@ def test_the_undisturbed_run_is_that_of_a_quiet_sweep(swept, tmp_path, monkeypat
 
 def test_a_single_run_ends_with_its_row(output_of, tmp_path):
     out = tmp_path / "out"
-    single = ("run", places("Segfaults"), "--plant", "kinematic", "--no-figures", "--set", "exp2.duration=0.5")
+    single = (
+        "run",
+        places("Segfaults"),
+        "--plant",
+        "kinematic",
+        "--no-figures",
+        "--set",
+        "exp2.duration=0.5",
+    )
     assert "1 of 1 run failed" in output_of(*single, "--out", out, code=1)
     assert results.load_runs(out)["status"].tolist() == ["crashed"]
 
 
-def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_that_hangs(tmp_path, monkeypatch):
+def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_that_hangs(
+    tmp_path, monkeypatch
+):
     out, mark = tmp_path / "out", "resumed"
     names = places("Quiet", "HangsWithChildren")
-    arguments = ("sweep", "--controllers", names, "--workers", "1", *SHORT, "--run-timeout", "3", "--out", str(out))
+    arguments = (
+        "sweep",
+        "--controllers",
+        names,
+        "--workers",
+        "1",
+        *SHORT,
+        "--run-timeout",
+        "3",
+        "--out",
+        str(out),
+    )
     process = start(*arguments, **{MARK: mark})
-    wait_for(lambda: part_count(out) > 0 and any("time.sleep(300)" in line for line in left_behind(MARK, mark)))
+    wait_for(
+        lambda: (
+            part_count(out) > 0
+            and any("time.sleep(300)" in line for line in left_behind(MARK, mark))
+        )
+    )
     os.kill(process.pid, signal.SIGKILL)
     finish(process)
     assert_nothing_stays(mark)
@@ -123,7 +151,15 @@ def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_
 
 def test_ctrl_c_ends_a_comparison_at_once(tmp_path):
     out, mark = tmp_path / "out", "interrupted"
-    comparing = ("compare", "--controllers", f"constant,{places('Hangs')}", "--tasks", "exp2", "--workers", "2")
+    comparing = (
+        "compare",
+        "--controllers",
+        f"constant,{places('Hangs')}",
+        "--tasks",
+        "exp2",
+        "--workers",
+        "2",
+    )
     process = start(*comparing, "--set", "exp2.duration=0.5", "--out", str(out), **{MARK: mark})
     wait_for(lambda: part_count(out) > 0)
     began = time.monotonic()

@@ -61,7 +61,10 @@ def test_without_friction_the_engines_differ_by_their_integrators_alone():
 def test_a_joint_with_weak_motors_stays_behind_as_its_torque_limit_says(open_plant):
     strong, weak = (
         swing(open_plant(replace(SMOOTH, drives=DriveConfig(torque_limit=limit))), 20)
-        for limit in ((150.0, 150.0, 150.0, 28.0, 28.0, 28.0), (150.0, 40.0, 150.0, 28.0, 28.0, 28.0))
+        for limit in (
+            (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+            (150.0, 40.0, 150.0, 28.0, 28.0, 28.0),
+        )
     )
     assert np.abs(strong - weak)[:, 1].max() > 0.01
 
@@ -106,7 +109,9 @@ def test_an_image_larger_than_any_before_is_rendered_and_white_beyond_the_floor(
     assert 0.5 < (depth == 1.0).mean() < 1.0
 
 
-def test_joint_angles_that_are_not_finite_end_the_run_and_leave_no_file(open_plant, monkeypatch, tmp_path):
+def test_joint_angles_that_are_not_finite_end_the_run_and_leave_no_file(
+    open_plant, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
     plant = open_plant()
     plant.reset(0)

@@ -9,7 +9,16 @@ import pytest
 from PIL import Image
 
 from page_studies import noise
-from page_studies.noise import ESTIMATORS, LEVELS, PLATE, POSITION, SetUp, family_sweep, pictures, tables
+from page_studies.noise import (
+    ESTIMATORS,
+    LEVELS,
+    PLATE,
+    POSITION,
+    SetUp,
+    family_sweep,
+    pictures,
+    tables,
+)
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import parse_magnitudes
 
@@ -17,7 +26,11 @@ from servobench.plant.robot.mismatch import parse_magnitudes
 def made_up(path):
     """Return runs of a family: the error grows with the place of the estimator; one run of `kalman` ends early."""
     family = path.name
-    places = [each.number for each in parse_magnitudes(family, LEVELS[family])] if LEVELS[family] else [np.nan]
+    places = (
+        [each.number for each in parse_magnitudes(family, LEVELS[family])]
+        if LEVELS[family]
+        else [np.nan]
+    )
     rows = [
         {"controller": f"pid+{name}", "seed": seed, "magnitude": place, "unit": "%", "status": "completed",
          "rms_error": (1.0 + 0.01 * i) * (1.0 + seed), "jacobian_error_mean": 0.3}
@@ -33,7 +46,9 @@ def made_up(path):
 def test_a_set_up_brings_its_size_of_a_pixel_and_its_options():
     words = family_sweep(SetUp("other", "other_errors", 0.5, ("--new", "word")), "stable")
     assert words[-2:] == ("--new", "word")
-    assert {"kinematic.sensing.noise_offset=10", "kinematic.sensing.feature_noise=0.707107"} <= set(words)
+    assert {"kinematic.sensing.noise_offset=10", "kinematic.sensing.feature_noise=0.707107"} <= set(
+        words
+    )
     assert "kinematic.sensing.feature_noise=0.001" in family_sweep(POSITION, "white")
 
 

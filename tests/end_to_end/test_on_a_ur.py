@@ -19,9 +19,18 @@ from kit.documents import ROOT
 from kit.served import fresh_address, served, waited_for
 from servobench.plant.robot.camera import CAMERA
 
-pytestmark = pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur-rtde has no wheel for this Python")
+pytestmark = pytest.mark.skipif(
+    find_spec("rtde_control") is None, reason="ur-rtde has no wheel for this Python"
+)
 EXAMPLE = ROOT / "docs" / "examples" / "on_a_ur.py"
-WIDE = ("--set", "UR.speed=1.0", "--set", "UR.box=[-2.0,-2.0,-2.0,2.0,2.0,2.0]", "--set", "UR.patience=60.0")
+WIDE = (
+    "--set",
+    "UR.speed=1.0",
+    "--set",
+    "UR.box=[-2.0,-2.0,-2.0,2.0,2.0,2.0]",
+    "--set",
+    "UR.patience=60.0",
+)
 SIGNALS = ("time_s", "reference_", "feature_", "joint_")
 
 
@@ -56,7 +65,9 @@ def python(*arguments):
 
 def on_a_ur(address, out, *arguments):
     """Start the example against an address."""
-    return python(str(EXAMPLE), "ukf_mfac", "--out", str(out), "--set", f'UR.host="{address}"', *arguments)
+    return python(
+        str(EXAMPLE), "ukf_mfac", "--out", str(out), "--set", f'UR.host="{address}"', *arguments
+    )
 
 
 def finished(process):
@@ -75,7 +86,9 @@ def numbers(steps):
 def test_in_lockstep_rows_and_commands_are_those_of_a_run(tmp_path):
     settings = {"target": {"duration": 2.0}}
     with served(settings=settings) as (_, address, _):
-        code, said = finished(on_a_ur(address, tmp_path / "served", *WIDE, "--set", "target.duration=2.0"))
+        code, said = finished(
+            on_a_ur(address, tmp_path / "served", *WIDE, "--set", "target.duration=2.0")
+        )
     assert code == 0, said
     run = servobench.run("ukf_mfac", task="target", robot="ur5e", settings=settings)
     rows = numbers(servobench.load(tmp_path / "served").steps)
@@ -110,14 +123,23 @@ def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
         pytest.skip("ur-rtde itself crashed or hung while it connected anew")
     row = servobench.load(tmp_path / "lost").runs.iloc[0]
     assert row["status"] == "crashed"
-    assert re.search("timed out|cannot be heard any more|has ended|takes no command|JSON", row["reason"]), row["reason"]
+    assert re.search(
+        "timed out|cannot be heard any more|has ended|takes no command|JSON", row["reason"]
+    ), row["reason"]
 
 
 @pytest.mark.slow
 def test_a_client_that_is_killed_leaves_an_arm_that_stands(tmp_path):
     with served(settings={"target": {"duration": 60.0}}, lockstep=False) as (_, address, lines):
         assert "serving in real time, in steps of 2 ms, at" in lines[0]
-        run = on_a_ur(address, tmp_path / "killed", "--set", "UR.patience=6.0", "--set", "target.duration=60.0")
+        run = on_a_ur(
+            address,
+            tmp_path / "killed",
+            "--set",
+            "UR.patience=6.0",
+            "--set",
+            "target.duration=60.0",
+        )
         assert waited_for(lambda: "control program of" in lines[-1], 60.0)
         time.sleep(1.0)
         run.kill()
@@ -168,7 +190,9 @@ def test_a_colour_ball_is_found_where_it_is_and_missed_where_it_is_not():
     along = rays @ ball / (rays**2).sum(axis=1)
     miss = ((along[:, None] * rays - ball) ** 2).sum(axis=1)
     hit = miss < radius**2
-    depth = np.where(hit, along - np.sqrt(np.maximum(radius**2 - miss, 0.0) / (rays**2).sum(axis=1)), 1.5).reshape(h, w)
+    depth = np.where(
+        hit, along - np.sqrt(np.maximum(radius**2 - miss, 0.0) / (rays**2).sum(axis=1)), 1.5
+    ).reshape(h, w)
     image = np.where(hit.reshape(h, w, 1), np.uint8([200, 20, 20]), np.uint8([90, 90, 90]))
     detector = runpy.run_path(str(EXAMPLE))["ColourBall"]
     feature, valid, stamp = detector(lambda: (image, depth, 7.0), CAMERA, radius).read()

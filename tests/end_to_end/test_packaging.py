@@ -33,10 +33,16 @@ def wheel_names(files):
 
 def test_the_wheel_holds_one_package_with_its_types(wheel_names):
     assert {name.split("/")[0].split("-")[0] for name in wheel_names} == {"servobench"}
-    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/contract/signals.py"} <= wheel_names
-    assert {name.split("/")[1] for name in wheel_names if name.startswith("servobench/") and name.count("/") > 1} == {
-        *FOLDERS
-    }
+    assert {
+        "servobench/py.typed",
+        "servobench/__main__.py",
+        "servobench/plant/contract/signals.py",
+    } <= wheel_names
+    assert {
+        name.split("/")[1]
+        for name in wheel_names
+        if name.startswith("servobench/") and name.count("/") > 1
+    } == {*FOLDERS}
 
 
 def test_the_wheel_holds_every_file_that_the_package_reads(wheel_names):
@@ -93,14 +99,18 @@ def test_a_source_distribution_without_tests_is_refused(files, tmp_path):
 
 def test_another_version_in_the_citation_is_told(files, tmp_path):
     for name in ("pyproject.toml", "CITATION.cff"):
-        (tmp_path / name).write_text((ROOT / name).read_text(encoding="utf-8").replace("\nversion: ", "\nversion: 9."))
+        (tmp_path / name).write_text(
+            (ROOT / name).read_text(encoding="utf-8").replace("\nversion: ", "\nversion: 9.")
+        )
     (fault,) = release.faults_of_versions(files[0], tmp_path)
     assert fault.startswith("CITATION.cff says version 9.")
 
 
 def test_only_the_tagged_commit_of_a_version_without_changes_is_a_release(tmp_path):
     def git(*words):
-        subprocess.run(["git", "-c", "user.name=A", "-c", "user.email=a@b.c", *words], cwd=tmp_path, check=True)
+        subprocess.run(
+            ["git", "-c", "user.name=A", "-c", "user.email=a@b.c", *words], cwd=tmp_path, check=True
+        )
 
     git("init", "--quiet")
     (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## Unreleased\n")
@@ -125,8 +135,12 @@ def test_only_the_tagged_commit_of_a_version_without_changes_is_a_release(tmp_pa
 def test_a_package_that_states_no_licence_is_told_unless_it_was_read(tmp_path):
     stated = {"name": "numpy", "licenses": [{"expression": "BSD-3-Clause"}]}
     bill = tmp_path / "bill.cdx.json"
-    bill.write_text(json.dumps({"components": [stated, {"name": "FMPy"}, {"name": "odd", "licenses": []}]}))
-    assert release.faults_of_licences(bill) == ["odd states no licence; read its files and add it to LICENCES"]
+    bill.write_text(
+        json.dumps({"components": [stated, {"name": "FMPy"}, {"name": "odd", "licenses": []}]})
+    )
+    assert release.faults_of_licences(bill) == [
+        "odd states no licence; read its files and add it to LICENCES"
+    ]
 
 
 def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
@@ -135,7 +149,13 @@ def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
 
 
 def test_the_citation_is_one_of_its_format(tmp_path):
-    check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.citation-file-format"]
+    check = [
+        sys.executable,
+        "-m",
+        "check_jsonschema",
+        "--builtin-schema",
+        "vendor.citation-file-format",
+    ]
     done = carried_out(*check, ROOT / "CITATION.cff")
     assert done.returncode == 0, done.stdout
     bad = tmp_path / "CITATION.cff"

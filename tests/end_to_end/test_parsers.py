@@ -60,7 +60,9 @@ FOUND: tuple[tuple[str, str | bytes], ...] = (  # what once was a traceback, a h
 )
 
 
-PASSED_OVER: tuple[tuple[str, str], ...] = (  # what does not keep a folder from being used, and was a traceback, too
+PASSED_OVER: tuple[
+    tuple[str, str], ...
+] = (  # what does not keep a folder from being used, and was a traceback, too
     ("lock", "[" * 3000),
     ("lock", HOLDER.replace('"pid": 4', '"pid": 1e999')),
     ("lock", HOLDER.replace('"pid": 4', '"pid": -1')),
@@ -81,7 +83,9 @@ def test_every_example_is_taken(name, tmp_path):
         assert check(PARSERS[name], example, tmp_path)
 
 
-@pytest.mark.parametrize(("name", "given_"), FOUND, ids=[f"{i}-{name}" for i, (name, _) in enumerate(FOUND)])
+@pytest.mark.parametrize(
+    ("name", "given_"), FOUND, ids=[f"{i}-{name}" for i, (name, _) in enumerate(FOUND)]
+)
 def test_what_once_broke_is_refused_in_one_line(name, given_, tmp_path):
     assert not check(PARSERS[name], given_, tmp_path)
 

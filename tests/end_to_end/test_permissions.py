@@ -27,11 +27,17 @@ def two_steps() -> str:
     joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     columns = [f"{what}_{axis}_m" for what in ("feature", "reference") for axis in "xyz"]
     columns += [f"joint_position_{name}_rad" for name in joints]
-    return ",".join(["time_s", *columns]) + "".join(f"\n{time}" + ",0.1" * len(columns) for time in (0, 0.05)) + "\n"
+    return (
+        ",".join(["time_s", *columns])
+        + "".join(f"\n{time}" + ",0.1" * len(columns) for time in (0, 0.05))
+        + "\n"
+    )
 
 
 @pytest.mark.parametrize(("call", "file"), FULL)
-def test_a_full_disk_is_one_line_with_the_file_and_leaves_none(call, file, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_is_one_line_with_the_file_and_leaves_none(
+    call, file, tmp_path, monkeypatch, capsys
+):
     def full(_path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -115,13 +121,16 @@ def told(tmp_path_factory):
     (folder / "steps.csv").write_text(two_steps())
     without = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"] if os.geteuid() == 0 else []
     own = os.environ | {"PYTHONPATH": str(PACKAGE)}
-    made = carried_out(*without, sys.executable, "-c", SCRIPT, cwd=folder, input=json.dumps(CASES), env=own)
+    made = carried_out(
+        *without, sys.executable, "-c", SCRIPT, cwd=folder, input=json.dumps(CASES), env=own
+    )
     return json.loads(made.stdout)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
 @pytest.mark.skipif(
-    os.name == "posix" and os.geteuid() == 0 and shutil.which("setpriv") is None, reason="root may write everywhere"
+    os.name == "posix" and os.geteuid() == 0 and shutil.which("setpriv") is None,
+    reason="root may write everywhere",
 )
 @pytest.mark.parametrize("call", CASES)
 def test_what_may_not_be_read_or_written_is_one_right_line(told, call):

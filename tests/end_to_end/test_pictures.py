@@ -13,12 +13,26 @@ from matplotlib.text import Text
 from PIL import Image
 
 from kit.command import servobench
-from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
+from kit.folders import (
+    CONTROLLERS,
+    comparison,
+    failed_only,
+    made_up_row,
+    made_up_steps,
+    sweep,
+    write_folder,
+)
 from servobench.harness.analysis.comparison import FROM_TWIN, split_tasks
 from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures import style
-from servobench.harness.pictures.figures import KINDS, Choice, draw_figures, folder_figures, page_figures
+from servobench.harness.pictures.figures import (
+    KINDS,
+    Choice,
+    draw_figures,
+    folder_figures,
+    page_figures,
+)
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import path_views
 from servobench.harness.pictures.style import (
@@ -70,11 +84,17 @@ def test_marks_lie_evenly_along_a_path_and_not_in_time():
 
 
 def test_the_page_of_results_names_every_kind_of_figure_in_its_order():
-    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8").split("## Figures")[1]
+    text = (
+        (Path(__file__).parents[2] / "docs" / "results.md")
+        .read_text(encoding="utf-8")
+        .split("## Figures")[1]
+    )
     assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(KINDS)
 
 
-def test_a_comparison_gives_the_figures_of_the_paper_and_more_with_a_unit_at_every_axis_and_every_controller(tmp_path):
+def test_a_comparison_gives_the_figures_of_the_paper_and_more_with_a_unit_at_every_axis_and_every_controller(
+    tmp_path,
+):
     figures = list(folder_figures(comparison(tmp_path / "out")))
     assert [named.kind for named in figures] == [
         "errors", "features", "paths", "tracking", "tracking_path", "jacobian", "settling", "effort", "smoothness",
@@ -91,7 +111,9 @@ def test_a_comparison_gives_the_figures_of_the_paper_and_more_with_a_unit_at_eve
             assert [axes.get_xlabel() for axes in figure.axes[-3:]] == ["time [s]"] * 3
         else:
             for axes in filter(lambda axes: axes.get_visible(), figure.axes):
-                assert axes.get_xlabel() or not any(label.get_visible() for label in axes.get_xticklabels()), named.stem
+                assert axes.get_xlabel() or not any(
+                    label.get_visible() for label in axes.get_xticklabels()
+                ), named.stem
                 labels = [axes.get_xlabel(), axes.get_ylabel()]
                 assert all("[" in label for label in labels if label), named.stem
         words = legend_of(figure)
@@ -115,11 +137,16 @@ def test_a_page_has_each_task_apart_for_a_screen_and_for_a_phone_and_nothing_is_
     assert all(wide.tasks == narrow.tasks and len(wide.tasks) == 1 for wide, narrow in figures)
     for wide, narrow in (pair for pair in figures if pair[0].tasks == ("exp1",)):
         for figure, layout in ((wide.figure, WIDE), (narrow.figure, NARROW)):
-            assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= TEXT - 2.0
+            assert (
+                min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text())
+                >= TEXT - 2.0
+            )
             figure.suptitle("")
             width = drawing_of(figure, layout).width
             assert width <= layout.pixels + 2
-        columns = {round(axes.get_position().x0, 2) for axes in narrow.figure.axes if axes.get_visible()}
+        columns = {
+            round(axes.get_position().x0, 2) for axes in narrow.figure.axes if axes.get_visible()
+        }
         assert len(columns) <= 2  # panels below each other, differing by the width of their numbers
 
 
@@ -166,10 +193,14 @@ def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
         assert min(width, height) > 100
 
 
-def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_one_is_told(tmp_path):
+def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_one_is_told(
+    tmp_path,
+):
     unknown = made_up_steps("a")
     unknown["jacobian_error"] = np.nan
-    assert "jacobian" not in kinds(write_folder(tmp_path / "unknown", [made_up_row("a")], [unknown]))
+    assert "jacobian" not in kinds(
+        write_folder(tmp_path / "unknown", [made_up_row("a")], [unknown])
+    )
     exact = made_up_steps("a")
     exact["jacobian_error"] = 0.0
     folder = write_folder(tmp_path / "exact", [made_up_row("a", controller="calibrated")], [exact])
@@ -180,37 +211,62 @@ def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_
 def test_a_plant_with_other_features_and_joints_is_drawn_under_its_own_names(tmp_path):
     steps = made_up_steps("a", features=("sway_angle_rad", "trolley_m"))
     row = made_up_row(
-        "a", plant="fmu:/some where/crane.toml", mismatch="none", task="target", feature_unit="rad", settling_band=0.1
+        "a",
+        plant="fmu:/some where/crane.toml",
+        mismatch="none",
+        task="target",
+        feature_unit="rad",
+        settling_band=0.1,
     )
-    drawn = {named.kind: named for named in folder_figures(write_folder(tmp_path / "out", [row], [steps]))}
-    assert set("".join(named.stem for named in drawn.values())) <= set("abcdefghijklmnopqrstuvwxyz_0123456789.")
+    drawn = {
+        named.kind: named
+        for named in folder_figures(write_folder(tmp_path / "out", [row], [steps]))
+    }
+    assert set("".join(named.stem for named in drawn.values())) <= set(
+        "abcdefghijklmnopqrstuvwxyz_0123456789."
+    )
     errors, features, paths = (drawn[kind].figure for kind in ("errors", "features", "paths"))
     assert [axes.get_ylabel() for axes in errors.axes] == ["true error [rad]"]
     assert "settling band, 0.1 rad" in legend_of(errors)
-    assert [axes.get_ylabel() for axes in features.axes] == ["measured\nsway_angle [rad]", "measured\ntrolley [m]"]
+    assert [axes.get_ylabel() for axes in features.axes] == [
+        "measured\nsway_angle [rad]",
+        "measured\ntrolley [m]",
+    ]
     (axes,) = paths.axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("sway_angle [rad]", "trolley [m]")
     assert axes.get_aspect() == "auto"
 
 
 def test_a_single_feature_has_no_path(tmp_path):
-    folder = write_folder(tmp_path / "out", [made_up_row("a")], [made_up_steps("a", features=("level_m",))])
+    folder = write_folder(
+        tmp_path / "out", [made_up_row("a")], [made_up_steps("a", features=("level_m",))]
+    )
     found = set(kinds(folder))
     assert {"errors", "features"} < found
     assert "paths" not in found
 
 
 def test_half_an_hour_is_drawn_with_few_points(tmp_path):
-    kind, run_id = {"task": "endurance", "task_kind": "curve"}, "kinematic-ukf_mfac-endurance-moderate-0"
+    kind, run_id = (
+        {"task": "endurance", "task_kind": "curve"},
+        "kinematic-ukf_mfac-endurance-moderate-0",
+    )
     steps = made_up_steps(run_id, curve=True, periods=36_000)
     folder = write_folder(tmp_path / "out", [made_up_row(run_id, **kind)], [steps])
-    lines = [line for named in folder_figures(folder) for axes in named.figure.axes for line in axes.get_lines()]
+    lines = [
+        line
+        for named in folder_figures(folder)
+        for axes in named.figure.axes
+        for line in axes.get_lines()
+    ]
     assert 100 < max(len(line.get_xdata()) for line in lines) <= 700
     assert 100 < str(path_views(folder, results.load_runs(folder))).count(",") < 20_000
 
 
 def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last_rows():
-    steps = made_up_steps("a", curve=True, periods=12_000).assign(error_norm=np.tile([3.0, 4.0], 6000))
+    steps = made_up_steps("a", curve=True, periods=12_000).assign(
+        error_norm=np.tile([3.0, 4.0], 6000)
+    )
     track = Track(made_up_row("a"), steps)
     overview, closing = track.overview(), track.closing()
     assert len(overview.table) == 600
@@ -238,23 +294,33 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "same")))
     assert draw_conditions(moves, method_styles(CONTROLLERS)) is None
     late, drawn = moves.assign(mismatch="jitter=50ms"), moves.assign(mismatch=FROM_TWIN)
-    line = draw_conditions(pd.concat([drawn, late]), method_styles(CONTROLLERS)).axes[0].get_lines()[0]
+    line = (
+        draw_conditions(pd.concat([drawn, late]), method_styles(CONTROLLERS)).axes[0].get_lines()[0]
+    )
     assert line.get_xdata().tolist() == [0.0, 50.0]
 
 
-def test_noise_that_is_crossed_with_an_axis_has_a_panel_and_noise_that_is_the_axis_none_of_its_own(tmp_path):
+def test_noise_that_is_crossed_with_an_axis_has_a_panel_and_noise_that_is_the_axis_none_of_its_own(
+    tmp_path,
+):
     runs = results.load_runs(sweep(tmp_path / "out"))
     moves = split_tasks(runs)[0].assign(axis="links", magnitude=5.0, unit="%", latency_s=np.nan)
     turned = moves.assign(axis="tool", magnitude=9.0)
 
     def labels(table):
         figure = draw_conditions(table, method_styles(CONTROLLERS))
-        return None if figure is None else [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
+        return (
+            None
+            if figure is None
+            else [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
+        )
 
-    assert labels(pd.concat([moves.assign(noise_factor=0.0), turned.assign(noise_factor=4.0)])) is None
-    assert labels(pd.concat([each.assign(noise_factor=n) for each in (moves, turned) for n in (0.0, 4.0)])) == [
-        "noise factor"
-    ]
+    assert (
+        labels(pd.concat([moves.assign(noise_factor=0.0), turned.assign(noise_factor=4.0)])) is None
+    )
+    assert labels(
+        pd.concat([each.assign(noise_factor=n) for each in (moves, turned) for n in (0.0, 4.0)])
+    ) == ["noise factor"]
 
 
 def test_a_picture_for_a_page_keeps_the_colour_of_each_method(tmp_path):
@@ -280,7 +346,9 @@ def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
 def paper(monkeypatch, folder, *arguments):
     """Return the exit code of `servobench figures` for a column of a paper, and the files that it made."""
     out = folder.parent / "paper"
-    code = servobench(monkeypatch, "figures", str(folder), "--width", "3.5in", "--out", str(out), *arguments)
+    code = servobench(
+        monkeypatch, "figures", str(folder), "--width", "3.5in", "--out", str(out), *arguments
+    )
     return code, sorted(out.glob("*")) if out.exists() else []
 
 
@@ -290,7 +358,9 @@ def test_every_figure_of_the_report_fits_a_column_of_a_paper(monkeypatch, tmp_pa
     words = ("--no-title", "--names", "Proposed,$K_p$ alone", "--kind", ",".join(wanted))
     code, files = paper(monkeypatch, folder, *words)
     assert code == 0
-    assert {kind for kind in wanted if any(path.name.startswith(f"{kind}_") for path in files)} == wanted
+    assert {
+        kind for kind in wanted if any(path.name.startswith(f"{kind}_") for path in files)
+    } == wanted
     for path in files:
         content = path.read_bytes()
         assert re.search(rb"/MediaBox \[ ?0 0 (\S+) ", content)[1] == b"252", path.name
@@ -309,7 +379,9 @@ def test_a_figure_is_as_wide_as_a_column_of_ieeetran_or_both(tmp_path, width):
 
 def test_figures_show_the_chosen_controllers_by_their_new_names_in_their_usual_style(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "mine", "rls"))
-    choice = Choice(("errors",), {"rls": "UKF+MFAC", "ukf_mfac": "Mine"}, Layout.of_width("89mm"), title=False)
+    choice = Choice(
+        ("errors",), {"rls": "UKF+MFAC", "ukf_mfac": "Mine"}, Layout.of_width("89mm"), title=False
+    )
     figures = list(folder_figures(folder, choice))
     assert [named.tasks for named in figures] == [("exp1",), ("exp2",)]
     for named in figures:
@@ -320,7 +392,9 @@ def test_figures_show_the_chosen_controllers_by_their_new_names_in_their_usual_s
         assert "mine" not in colours
 
 
-def test_figures_come_in_the_formats_that_are_asked_for_and_the_same_each_time(monkeypatch, tmp_path):
+def test_figures_come_in_the_formats_that_are_asked_for_and_the_same_each_time(
+    monkeypatch, tmp_path
+):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     _, files = paper(monkeypatch, folder, "--kind", "errors", "--format", "pdf,svg,png")
     before = {path.name: path.read_bytes() for path in files}
@@ -333,7 +407,9 @@ def test_figures_come_in_the_formats_that_are_asked_for_and_the_same_each_time(m
 def test_a_figure_for_tex_has_the_width_of_the_column(monkeypatch, tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     _, (path,) = paper(monkeypatch, folder, "--kind", "errors", "--format", "pgf")
-    width = re.search(r"\\pgfpathrectangle\{\\pgfpointorigin\}\{\\pgfqpoint\{([\d.]+)in", path.read_text())[1]
+    width = re.search(
+        r"\\pgfpathrectangle\{\\pgfpointorigin\}\{\\pgfqpoint\{([\d.]+)in", path.read_text()
+    )[1]
     assert float(width) == pytest.approx(3.5)
     assert "ukf\\_mfac" in path.read_text()
 
@@ -342,12 +418,21 @@ def test_a_figure_for_tex_has_the_width_of_the_column(monkeypatch, tmp_path):
     ("arguments", "line"),
     [
         (("--kind", "error"), "--kind: unknown 'error': did you mean 'errors'?"),
-        (("--controllers", "ukf_mfca"), "--controllers: unknown 'ukf_mfca': did you mean 'ukf_mfac'?"),
+        (
+            ("--controllers", "ukf_mfca"),
+            "--controllers: unknown 'ukf_mfca': did you mean 'ukf_mfac'?",
+        ),
         (("--names", "a,b"), "--names has 2 names for 1 controllers: ukf_mfac"),
         (("--width", "3.5"), "--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got 3.5"),
         (("--format", "eps"), "--format: unknown 'eps': "),
-        (("--format", "pgf"), "--format pgf needs a TeX while it is drawn, pdflatex, lualatex or xelatex, and there"),
-        (("--kind", "tracking"), "has no figure of tracking: errors and paths are of moves, tracking is of curves"),
+        (
+            ("--format", "pgf"),
+            "--format pgf needs a TeX while it is drawn, pdflatex, lualatex or xelatex, and there",
+        ),
+        (
+            ("--kind", "tracking"),
+            "has no figure of tracking: errors and paths are of moves, tracking is of curves",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(monkeypatch, capsys, tmp_path, arguments, line):

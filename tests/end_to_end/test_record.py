@@ -98,7 +98,9 @@ def films(run, tmp_path_factory):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
     told = []
     stem = tmp_path_factory.mktemp("films") / "run"
-    paths = film.write_recording(stretch(run, 0.0, 0.95), stem, ("mp4", "gif"), lambda *said: told.append(said))
+    paths = film.write_recording(
+        stretch(run, 0.0, 0.95), stem, ("mp4", "gif"), lambda *said: told.append(said)
+    )
     return paths, told
 
 
@@ -143,7 +145,9 @@ def test_snapshots_are_equally_far_apart_along_the_way():
 @given(st.integers(1, 30), st.integers(2, 12), st.integers(0, 2**31))
 def test_snapshots_are_different_instants_in_order_whatever_the_ball_does(periods, count, seed):
     generator = np.random.default_rng(seed)
-    ball = generator.normal(size=(periods, 3)) * generator.choice([0.0, 1.0, 100.0], size=(periods, 1))
+    ball = generator.normal(size=(periods, 3)) * generator.choice(
+        [0.0, 1.0, 100.0], size=(periods, 1)
+    )
     chosen = film.snapshot_instants(ball, count)
     assert len(chosen) == min(count, periods)
     assert sorted(set(chosen)) == chosen
@@ -156,7 +160,9 @@ def test_a_stretch_of_a_run_keeps_its_times_and_rows(run):
     assert part.ball.tolist() == run.ball[10:31].tolist()
     assert part.moved_from == run.moved_from - 10
     assert stretch(run, 0.0, None).track.table.equals(run.track.table)
-    with pytest.raises(ConfigurationError, match="has no instant from 3 to 4 s: it goes from 0 to 1.95 s"):
+    with pytest.raises(
+        ConfigurationError, match="has no instant from 3 to 4 s: it goes from 0 to 1.95 s"
+    ):
         stretch(run, 3.0, 1.0)
 
 
@@ -165,7 +171,9 @@ def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch
     encoder.find_ffmpeg()  # which starts one the first time
     started = []
     popen = subprocess.Popen
-    monkeypatch.setattr(encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+    monkeypatch.setattr(
+        encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
+    )
 
     def interrupt(share, what):
         if share > 0.1:
@@ -187,7 +195,9 @@ def write_frames(path):
 def test_a_film_that_ffmpeg_cannot_write_is_one_line_with_its_reason(tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
     target = tmp_path / "none" / "run.mp4"
-    with pytest.raises(ConfigurationError, match=r"ffmpeg cannot write .*run.mp4: .*No such file or directory"):
+    with pytest.raises(
+        ConfigurationError, match=r"ffmpeg cannot write .*run.mp4: .*No such file or directory"
+    ):
         write_frames(target)
 
 
@@ -220,31 +230,51 @@ def test_without_ffmpeg_there_is_one_line(refusal_of, monkeypatch, tmp_path, fol
 def test_a_new_run_is_recorded_below_the_results_without_ffmpeg(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    arguments = ["--plant", "kinematic", "--controller", "constant", "--task", "exp2", "--kinds", "snapshots"]
+    arguments = [
+        "--plant",
+        "kinematic",
+        "--controller",
+        "constant",
+        "--task",
+        "exp2",
+        "--kinds",
+        "snapshots",
+    ]
     assert servobench(monkeypatch, "record", *arguments, "--set", "exp2.duration=0.5") == 0
     name = "kinematic-constant-exp2-moderate-0_snapshots"
-    assert {path.name for path in (tmp_path / "results" / "recordings").iterdir()} == {f"{name}.png", f"{name}.pdf"}
+    assert {path.name for path in (tmp_path / "results" / "recordings").iterdir()} == {
+        f"{name}.png",
+        f"{name}.pdf",
+    }
     assert f"{name}.png" in capsys.readouterr().out
 
 
 def test_a_file_named_as_a_film_is_that_film(refusal_of, monkeypatch, tmp_path, folder):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
     target = tmp_path / "mine.gif"
-    assert servobench(monkeypatch, "record", str(folder), "--out", str(target), "--length", "0.2") == 0
+    assert (
+        servobench(monkeypatch, "record", str(folder), "--out", str(target), "--length", "0.2") == 0
+    )
     assert target.read_bytes().startswith(b"GIF8")
     assert list(tmp_path.iterdir()) == [target]
-    assert "names one film; leave --kinds mp4 away" in refusal_of("record", folder, "--out", target, "--kinds", "mp4")
+    assert "names one film; leave --kinds mp4 away" in refusal_of(
+        "record", folder, "--out", target, "--kinds", "mp4"
+    )
 
 
 def test_runs_that_cannot_be_shown_are_refused(result):
     row, steps = result.row, result.steps
     with pytest.raises(ConfigurationError, match="has no steps: it ended before its first period"):
         logged_run(row, steps.iloc[:0])
-    with pytest.raises(ConfigurationError, match=r"has 5 joint positions \[rad\]; wanted the 6 of a UR5"):
+    with pytest.raises(
+        ConfigurationError, match=r"has 5 joint positions \[rad\]; wanted the 6 of a UR5"
+    ):
         logged_run(row, steps.drop(columns="joint_position_elbow_rad"))
     other = json.loads(row["mismatch_values"])
     other["tool_offset"][0] += 1e-3
-    with pytest.raises(ConfigurationError, match="was made on another robot than mismatch moderate and seed 3"):
+    with pytest.raises(
+        ConfigurationError, match="was made on another robot than mismatch moderate and seed 3"
+    ):
         logged_run(row | {"mismatch_values": json.dumps(other)}, steps)
     with pytest.raises(ConfigurationError, match="'mild' is not known"):
         logged_run(row | {"mismatch": "mild"}, steps)
@@ -253,7 +283,16 @@ def test_runs_that_cannot_be_shown_are_refused(result):
 def run_on(monkeypatch, folder, text, *arguments):
     """Carry out a short run on a plant of a file, which later commands do not know."""
     write(folder, text, "cell.py")
-    arguments = ("run", "constant", "--plant", "./cell.py", *arguments, "--no-figures", "--out", "out")
+    arguments = (
+        "run",
+        "constant",
+        "--plant",
+        "./cell.py",
+        *arguments,
+        "--no-figures",
+        "--out",
+        "out",
+    )
     assert servobench(monkeypatch, *arguments) == 0
 
 
@@ -261,14 +300,34 @@ def test_a_run_on_an_own_plant_with_the_arm_is_recorded(monkeypatch, capsys, tmp
     monkeypatch.chdir(tmp_path)
     run_on(monkeypatch, tmp_path, CELL, "--task", "exp2", "--set", "exp2.duration=0.1")
     (tmp_path / "cell.py").unlink()  # the log is enough
-    assert servobench(monkeypatch, "record", "out", "--kinds", "snapshots") == 0, capsys.readouterr().err
-    assert (tmp_path / "out" / "recordings" / "Cell-constant-exp2-moderate-0_snapshots.png").stat().st_size > 10_000
+    assert servobench(monkeypatch, "record", "out", "--kinds", "snapshots") == 0, (
+        capsys.readouterr().err
+    )
+    assert (
+        tmp_path / "out" / "recordings" / "Cell-constant-exp2-moderate-0_snapshots.png"
+    ).stat().st_size > 10_000
 
 
 def test_a_plant_with_a_robot_of_its_own_is_refused(refusal_of, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    target = ("--task", "target", "--set", "target.target=[0.2, 0.7]", "--set", "target.duration=0.5")
-    run_on(monkeypatch, tmp_path, PLAIN_CELL, *target, "--mismatch", "none", "--set", "constant.initial.source=probe")
+    target = (
+        "--task",
+        "target",
+        "--set",
+        "target.target=[0.2, 0.7]",
+        "--set",
+        "target.duration=0.5",
+    )
+    run_on(
+        monkeypatch,
+        tmp_path,
+        PLAIN_CELL,
+        *target,
+        "--mismatch",
+        "none",
+        "--set",
+        "constant.initial.source=probe",
+    )
     line = refusal_of("record", "out", "--kinds", "snapshots")
     assert "cannot be shown: plant Plain brings a robot of its own\n" in line
 

@@ -19,7 +19,9 @@ def test_another_process_sees_the_same_bits(open_plant, engine):
         "print('bits', wiggle(plant, 3).tobytes().hex())"
     )
     root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
+    )
     bits = next(line for line in done.stdout.splitlines() if line.startswith("bits")).split()[1]
     assert bits == wiggle(open_plant(), 3).tobytes().hex()
 

@@ -25,7 +25,9 @@ def test_reported_joints_move_as_commanded(open_plant, model):
     plant.reset(0)
     u = np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.5])
     for k in range(1, 5):
-        np.testing.assert_allclose(plant.step(Command(u)).joint_position, start + u * 0.05 * k, atol=1e-8)
+        np.testing.assert_allclose(
+            plant.step(Command(u)).joint_position, start + u * 0.05 * k, atol=1e-8
+        )
 
 
 def test_without_dynamics_a_joint_follows_a_first_order_lag(open_plant):
@@ -125,7 +127,10 @@ def test_an_obstacle_hides_the_ball_and_stands_in_the_way(open_plant):
 
 def test_neighbouring_links_never_count_as_contact(open_plant):
     own = replace(BARE, self_contact=True)
-    contacts, rng = open_plant(replace(own, room_contact=False)).world._contacts, np.random.default_rng(0)
+    contacts, rng = (
+        open_plant(replace(own, room_contact=False)).world._contacts,
+        np.random.default_rng(0),
+    )
     names = ["base", *MODEL.arm.joint_names]
     met = [contacts.find(rng.uniform(-np.pi, np.pi, 6)) for _ in range(200)]
     assert open_plant(own).world._contacts.find(HOME) is None

@@ -8,7 +8,14 @@ from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered import detectors
-from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
+from servobench.plant.rendered.detection import (
+    MARGIN,
+    RED_RANGE,
+    find_patch,
+    locate_ball,
+    whole,
+    window_around,
+)
 from servobench.plant.rendered.detectors import DepthCamera, ImageNoise, measure_depth
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
@@ -38,7 +45,9 @@ def errors_over_poses(open_scene, noise, count) -> tuple[np.ndarray, int]:
 
 def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre(open_scene):
     # Table and floor change no bit of what is found, as a test below shows, and cost most of the time.
-    errors, tried = errors_over_poses(open_scene, RenderedConfig(depth_noise="none", depth_quantisation=0.0), 60)
+    errors, tried = errors_over_poses(
+        open_scene, RenderedConfig(depth_noise="none", depth_quantisation=0.0), 60
+    )
     distance = np.linalg.norm(errors, axis=1)
     assert np.median(distance) <= 0.0002
     assert distance.max() <= 0.001
@@ -54,17 +63,22 @@ def test_with_noise_the_centre_has_no_bias_of_note(open_scene, model):
         assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
 
 
-def test_stereo_noise_without_patches_moves_the_centre_by_less_than_the_noise_of_kinematic(open_scene):
+def test_stereo_noise_without_patches_moves_the_centre_by_less_than_the_noise_of_kinematic(
+    open_scene,
+):
     white, _ = errors_over_poses(open_scene, RenderedConfig(depth_patch=0.0), 50)
     assert (white.std(axis=0) < 0.001).all()
 
 
 def test_table_and_floor_cost_time_and_change_no_bit_of_an_observation(open_plant):
-    np.testing.assert_array_equal(wiggle(open_plant(RenderedConfig()), 3, 6), wiggle(open_plant(BARE), 3, 6))
+    np.testing.assert_array_equal(
+        wiggle(open_plant(RenderedConfig()), 3, 6), wiggle(open_plant(BARE), 3, 6)
+    )
 
 
 def test_a_ball_that_gets_hidden_is_not_valid_and_the_last_feature_is_held(open_plant):
-    before_arm = np.array([2.97, -1.72, 2.05, -0.40, 1.70, 0.0])  # turning wrist 1 takes the ball under the arm
+    # Turning wrist 1 takes the ball under the arm
+    before_arm = np.array([2.97, -1.72, 2.05, -0.40, 1.70, 0.0])
     plant = open_plant(IDEAL, before_arm)
     observation = plant.reset(0)
     turn = Command(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
@@ -79,7 +93,9 @@ def test_a_ball_that_gets_hidden_is_not_valid_and_the_last_feature_is_held(open_
 
 def test_a_ball_that_is_hidden_at_the_start_is_reported_with_evidence(open_plant):
     plant = open_plant(start=FLANGE_DOWN)
-    with pytest.raises(FeatureLost, match=r"not visible at the start .* in the camera frame, column and row"):
+    with pytest.raises(
+        FeatureLost, match=r"not visible at the start .* in the camera frame, column and row"
+    ):
         plant.reset(0)
 
 
@@ -93,7 +109,9 @@ def poses(scene, depth_camera, count):
         yield (
             X_BC,
             window_around(
-                X_BC[:3, :3].T @ (scene.ball_position() - X_BC[:3, 3]), depth_camera.radius, depth_camera.camera
+                X_BC[:3, :3].T @ (scene.ball_position() - X_BC[:3, 3]),
+                depth_camera.radius,
+                depth_camera.camera,
             ),
         )
 

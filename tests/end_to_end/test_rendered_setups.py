@@ -48,7 +48,9 @@ def open_setup(engine):
 
 
 @pytest.mark.parametrize("word", IN_PIXELS)
-def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word, engine):
+def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(
+    word, engine
+):
     model, rng = true_model(word), np.random.default_rng(5)
     scene = load_engine(engine).scene(Room(model.arm, scenery=False, robot=UR5, model=model))
     detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0
@@ -78,7 +80,9 @@ def test_a_plant_sees_its_target_from_the_start_and_follows_it(word, open_setup)
         observation = plant.step(Command(np.full(6, 0.1)))
     truth = plant.truth()
     np.testing.assert_allclose(truth.feature, model.feature(observation.joint_position), atol=1e-9)
-    assert np.linalg.norm(observation.feature - truth.feature) < (0.003 if word == "position:hand" else 1.0)
+    assert np.linalg.norm(observation.feature - truth.feature) < (
+        0.003 if word == "position:hand" else 1.0
+    )
     assert plant.picture().shape == (240, 320 * model.setup.cameras, 3)
 
 
@@ -96,11 +100,15 @@ def test_cameras_of_small_and_large_arms_see_the_target(tmp_path, open_setup, sc
     text = re.sub(r"\b0\.\d+\b", lambda found: lengths.get(found[0], found[0]), FOUR_JOINTS)
     robot = find_robot(str(write(tmp_path, text, "arm.toml")))
     model = Sensing.parse(word).nominal(robot)
-    plant = open_setup(model, replace(IDEAL, drives=rendered_config(robot).drives), robot.workspace.home, robot)
+    plant = open_setup(
+        model, replace(IDEAL, drives=rendered_config(robot).drives), robot.workspace.home, robot
+    )
     observation = plant.reset(0)
     assert observation.feature_valid
     np.testing.assert_allclose(
-        observation.feature, plant.truth().feature, atol=0.005 * scale if word == "position" else 1.0
+        observation.feature,
+        plant.truth().feature,
+        atol=0.005 * scale if word == "position" else 1.0,
     )
 
 
@@ -119,9 +127,22 @@ def test_a_hidden_disc_is_lost_alone_and_held(open_setup):
 
 def test_what_cannot_be_rendered_is_refused(open_setup):
     model = true_model("pixel")
-    two = SensingSetup("two", "", ("a", "b", "c", "d"), "px", model.setup.measure, target=((0.0,) * 3, (0.1, 0.0, 0.0)))
-    with pytest.raises(ValueError, match="a ball, of one point, or a plate with three or four discs"):
+    two = SensingSetup(
+        "two",
+        "",
+        ("a", "b", "c", "d"),
+        "px",
+        model.setup.measure,
+        target=((0.0,) * 3, (0.1, 0.0, 0.0)),
+    )
+    with pytest.raises(
+        ValueError, match="a ball, of one point, or a plate with three or four discs"
+    ):
         open_setup(replace(model, setup=two, target=np.array(two.target)))
-    deep = replace(model.setup, name="deep", measure=lambda points, optics: optics.focal * points[..., 0, 0, :2])
+    deep = replace(
+        model.setup,
+        name="deep",
+        measure=lambda points, optics: optics.focal * points[..., 0, 0, :2],
+    )
     with pytest.raises(ValueError, match="sensing deep needs depth, and the intrinsics"):
         open_setup(replace(model, setup=deep))

@@ -59,7 +59,9 @@ def toy(monkeypatch, tmp_path):
 
 
 def call(folder: Path, *options: str) -> int:
-    return renewal.main(["toy", "--runs", str(folder / "runs"), "--into", str(folder / "docs"), *TRIED, *options])
+    return renewal.main(
+        ["toy", "--runs", str(folder / "runs"), "--into", str(folder / "docs"), *TRIED, *options]
+    )
 
 
 def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
@@ -67,7 +69,9 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
     stored = stored_tables.read(toy / "docs" / "tables" / "counts.csv")
     assert stored.table.to_dict("records") == [{"method": "constant", "runs": "3"}]
     assert stored.stamp["study"] == "toy"
-    assert stored.stamp["command"].startswith("servobench sweep --plants kinematic --controllers constant")
+    assert stored.stamp["command"].startswith(
+        "servobench sweep --plants kinematic --controllers constant"
+    )
     assert len(stored.stamp["commit"]) >= 40
     page = write(toy / "docs", "<!-- table: counts -->\nold\n<!-- end -->\n", "page.md")
     shown = generated_tables.renewed(page)
@@ -82,10 +86,18 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
 
 def test_a_study_that_was_interrupted_goes_on_and_one_of_other_code_begins_anew(toy, monkeypatch):
     carried_out = []
-    monkeypatch.setattr(renewal, "run", lambda words, out: carried_out.append((out.name, list(words))) or "line")
-    study = replace(MOVES, commands={"first": ("sweep", "--seeds", "0:9"), "second": lambda _: ("sweep",), "none": ()})
+    monkeypatch.setattr(
+        renewal, "run", lambda words, out: carried_out.append((out.name, list(words))) or "line"
+    )
+    study = replace(
+        MOVES,
+        commands={"first": ("sweep", "--seeds", "0:9"), "second": lambda _: ("sweep",), "none": ()},
+    )
     folder = renewal.carry_out(study, toy, 2, ["--x"], keep=False)
-    assert carried_out == [("first", ["sweep", "--seeds", "0:2", "--x"]), ("second", ["sweep", "--x"])]
+    assert carried_out == [
+        ("first", ["sweep", "--seeds", "0:2", "--x"]),
+        ("second", ["sweep", "--x"]),
+    ]
     (folder / "second.done").unlink()
     renewal.carry_out(study, toy, None, [], keep=False)
     assert carried_out[2:] == [("second", ["sweep"])]
@@ -135,14 +147,28 @@ def test_cells_may_differ_as_rounding_makes_them(found, wanted, same):
 
 
 def test_an_unknown_study_is_one_line_that_names_them_all():
-    with pytest.raises(SystemExit, match="no study is called nonsense; there are challenges, held_out, rendered, "):
+    with pytest.raises(
+        SystemExit, match="no study is called nonsense; there are challenges, held_out, rendered, "
+    ):
         renewal.main(["nonsense"])
 
 
 def test_all_tables_of_pages_belong_to_a_study_and_all_stored_ones_are_on_a_page():
-    parts = [part for page in generated_tables.PAGES for part in generated_tables.PART.findall(page.read_text())]
-    shown = {name for _, kind, names, *_ in parts if kind in {"table", "stored"} for name in names.split(",")}
-    stored = {path.stem: stored_tables.read(path).stamp["study"] for path in stored_tables.FOLDER.glob("*.csv")}
+    parts = [
+        part
+        for page in generated_tables.PAGES
+        for part in generated_tables.PART.findall(page.read_text())
+    ]
+    shown = {
+        name
+        for _, kind, names, *_ in parts
+        if kind in {"table", "stored"}
+        for name in names.split(",")
+    }
+    stored = {
+        path.stem: stored_tables.read(path).stamp["study"]
+        for path in stored_tables.FOLDER.glob("*.csv")
+    }
     assert set(stored) <= shown
     assert set(stored.values()) <= set(STUDIES)
     source = "".join(path.read_text() for path in (ROOT / "docs" / "page_studies").glob("*.py"))
@@ -168,12 +194,25 @@ def test_methods_tasks_and_settings_of_the_sweeps_are_known_and_fit_each_other(s
         if callable(words) or words[0] != "sweep":
             continue
         pairs = list(pairwise(words))
-        settings, varied = ([value for name, value in pairs if name == each] for each in ("--set", "--vary"))
+        settings, varied = (
+            [value for name, value in pairs if name == each] for each in ("--set", "--vary")
+        )
         usual = {"plants": "", "controllers": "", "tasks": "", "mismatch": "moderate"}
-        lists = [tuple(option(words, f"--{name}", value).split(",")) for name, value in usual.items()]
+        lists = [
+            tuple(option(words, f"--{name}", value).split(",")) for name, value in usual.items()
+        ]
         seeds = parse_seeds(option(words, "--seeds"))[:1]
-        batch = Batch(*lists, seeds, option(words, "--robot", "ur5"), (option(words, "--sensing", "position"),))
-        varied += [f"{name}={option(words, f'--{name}')}" for name in ("latency", "period") if f"--{name}" in words]
+        batch = Batch(
+            *lists,
+            seeds,
+            option(words, "--robot", "ur5"),
+            (option(words, "--sensing", "position"),),
+        )
+        varied += [
+            f"{name}={option(words, f'--{name}')}"
+            for name in ("latency", "period")
+            if f"--{name}" in words
+        ]
         requests = [cell.request for cell in SweepPlan.parse(batch, varied).cells()]
         given = read_settings(None, settings)
         sections = resolve_sections(requests, given, to_run=False)  # PyBullet need not be installed
@@ -211,20 +250,39 @@ def lay_out_suite(folder):
     }  # fmt: skip
     methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN))
     pd.DataFrame([{**own, "controller": name} for name in methods]).to_csv(folder / "methods.csv")
-    rank = {"rank": 1, "score.value": 0.5, "score.low": 0.4, "score.high": 0.6, "lost, %": 1.0, "within 2×": 0.5}
-    pd.DataFrame([{**rank, "controller": name} for name in worlds.RENDERED]).to_csv(folder / "ranking.csv")
+    rank = {
+        "rank": 1,
+        "score.value": 0.5,
+        "score.low": 0.4,
+        "score.high": 0.6,
+        "lost, %": 1.0,
+        "within 2×": 0.5,
+    }
+    pd.DataFrame([{**rank, "controller": name} for name in worlds.RENDERED]).to_csv(
+        folder / "ranking.csv"
+    )
 
 
 @pytest.mark.parametrize("module", [held_out, physical, worlds], ids=lambda module: module.__name__)
 def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path, module):
     steps = pd.DataFrame({"error_norm": np.full(50, 0.001)})
     monkeypatch.setattr(module, "load_steps", lambda *_: steps, raising=False)
-    parts = [part for page in generated_tables.PAGES for part in generated_tables.PART.findall(page.read_text())]
+    parts = [
+        part
+        for page in generated_tables.PAGES
+        for part in generated_tables.PART.findall(page.read_text())
+    ]
     shown = {name for _, _, names, *_ in parts for name in names.split(",")}
     for part in ("runs", *worlds.LEARNING.commands):
         lay_out_suite(tmp_path / part)
-    for study in (value for value in vars(module).values() if isinstance(value, Study) and value.tables is not nothing):
-        monkeypatch.setattr(module, "load_runs", lambda path, study=study: toy_runs(study.commands[path.name]))
+    for study in (
+        value
+        for value in vars(module).values()
+        if isinstance(value, Study) and value.tables is not nothing
+    ):
+        monkeypatch.setattr(
+            module, "load_runs", lambda path, study=study: toy_runs(study.commands[path.name])
+        )
         for name, table in study.tables(tmp_path).items():
             assert len(table) or name == "held_out_studies"
             assert table.map(lambda cell: isinstance(cell, str)).all(axis=None), name
@@ -236,18 +294,28 @@ def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
         "compare", "--plants", "kinematic", "--controllers", "calibrated", "--tasks", "exp2,circle", "--mismatch",
         "none", "--seeds", "0:1", "--no-figures", "--no-report", "--workers", "1",
     )  # fmt: skip
-    folder = renewal.carry_out(replace(README, commands={"batch": short}), tmp_path, None, [], keep=False)
+    folder = renewal.carry_out(
+        replace(README, commands={"batch": short}), tmp_path, None, [], keep=False
+    )
     for name, content in pictures.readme_pictures(folder).items():
         path = tmp_path / Path(name).name
         path.write_bytes(content)
         assert path.stat().st_size < 300e3
         with Image.open(path) as picture:
             assert picture.size[0] >= 450
-    assert {path.name for path in tmp_path.glob("*.png")} == {"bench.png", "errors.png", "paths.png", "circle.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        "bench.png",
+        "errors.png",
+        "paths.png",
+        "circle.png",
+    }
 
 
 def test_the_command_draws_the_map(output_of, monkeypatch, tmp_path):
-    lines = replace(robustness.LINES[4], places=robustness.LINES[4].places[:2]), robustness.LINES[-1]
+    lines = (
+        replace(robustness.LINES[4], places=robustness.LINES[4].places[:2]),
+        robustness.LINES[-1],
+    )
     monkeypatch.setattr(robustness, "LINES", lines)
     monkeypatch.setattr(robustness, "KNOWN_LINES", {line.axis: line for line in lines})
     out = tmp_path / "robustness" / "map"
@@ -271,7 +339,9 @@ def test_numbers_of_runs_that_crashed_are_not_stored(toy):
     runs = pd.read_parquet(table)
     runs.loc[0, ["status", "reason"]] = "crashed", "OSError: no more room"
     runs.to_parquet(table)
-    with pytest.raises(SystemExit, match=r"1 of 3 runs in .* crashed, nothing is stored: OSError: no more room"):
+    with pytest.raises(
+        SystemExit, match=r"1 of 3 runs in .* crashed, nothing is stored: OSError: no more room"
+    ):
         call(toy)
 
 
@@ -304,14 +374,17 @@ def test_a_difference_that_holds_on_one_engine_only_is_in_bold_on_both():
         return shown["bullet"].startswith("**")
 
     spread = 0.1 * np.sin(robots)
-    later, earlier, alike = (runs(usual=1.0, changed=1.0 + shift + spread) for shift in (0.5, -0.5, 0.0))
+    later, earlier, alike = (
+        runs(usual=1.0, changed=1.0 + shift + spread) for shift in (0.5, -0.5, 0.0)
+    )
     assert bold(later, alike)
     assert bold(later, earlier)
     assert not bold(later, runs(usual=2.0, changed=2.9 + spread))
     assert not bold(alike, alike)
     barely = runs(usual=1.0, changed=1.07 + spread)
     hardly = runs(usual=1.0, changed=1.04 + 0.2 * np.cos(5 * robots))
-    assert not bold(barely, hardly)  # one interval leaves 0 out and the other does not, but they differ by chance
+    # One interval leaves 0 out and the other does not, but they differ by chance
+    assert not bold(barely, hardly)
 
 
 def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):
@@ -320,7 +393,16 @@ def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):
 
 
 def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
-    command = [sys.executable, "benchmarks/page.py", "--quick", "--out", tmp_path, "--only", "limits", "shares"]
+    command = [
+        sys.executable,
+        "benchmarks/page.py",
+        "--quick",
+        "--out",
+        tmp_path,
+        "--only",
+        "limits",
+        "shares",
+    ]
     done = carried_out(*command, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "performance.md").read_text(encoding="utf-8")

@@ -9,14 +9,24 @@ import pytest
 
 from kit.browser import browser_page, find_browser
 from kit.command import servobench
-from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
+from kit.folders import (
+    CONTROLLERS,
+    comparison,
+    failed_only,
+    made_up_row,
+    made_up_steps,
+    sweep,
+    write_folder,
+)
 from servobench.harness.batch import results
 from servobench.harness.pictures import report
 from servobench.plant.contract.checksums import write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 
 RUN = ("run", "constant", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--no-figures")
-needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
+needs_browser = pytest.mark.skipif(
+    find_browser() is None, reason="no Chromium: the report is not opened in a browser"
+)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +34,14 @@ def compared(tmp_path_factory):
     """A real, small comparison with its report, and what the command said."""
     out = tmp_path_factory.mktemp("compared") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        arguments = ["--plants", "kinematic", "--controllers", "constant,calibrated", "--tasks", "exp2"]
+        arguments = [
+            "--plants",
+            "kinematic",
+            "--controllers",
+            "constant,calibrated",
+            "--tasks",
+            "exp2",
+        ]
         quick = ["--set", "exp2.duration=2", "--workers", "1", "--no-figures"]
         assert servobench(patch, "compare", *arguments, *quick, "--out", str(out)) == 0
     return out
@@ -43,12 +60,19 @@ def notebook_cells():
 
 
 def test_the_notebook_is_committed_without_outputs():
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in notebook_cells())
+    assert all(
+        cell["outputs"] == [] and cell["execution_count"] is None for cell in notebook_cells()
+    )
 
 
 def test_the_notebook_shows_every_kind_of_figure_of_the_report():
-    calls = re.findall(r"show_pictures\((\".*\")\)", "\n".join("".join(cell["source"]) for cell in notebook_cells()))
-    assert set(", ".join(calls).split(", ")) == {f'"{name}"' for name, kind in report.KINDS.items() if kind.in_page}
+    calls = re.findall(
+        r"show_pictures\((\".*\")\)",
+        "\n".join("".join(cell["source"]) for cell in notebook_cells()),
+    )
+    assert set(", ".join(calls).split(", ")) == {
+        f'"{name}"' for name, kind in report.KINDS.items() if kind.in_page
+    }
 
 
 def small_comparison(folder: Path) -> Path:
@@ -94,7 +118,9 @@ def test_a_folder_of_many_runs_stays_small_and_shows_what_went_wrong_first(tmp_p
 
 def test_the_path_of_the_report_is_told_at_the_end(output_of, monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS))
+    monkeypatch.setattr(
+        report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS)
+    )
     *_, last = output_of(*RUN, "--report", "--out", tmp_path / "a").strip().splitlines()
     assert last.startswith(f"report: {tmp_path / 'a'}")
     assert "report:" not in output_of(*RUN, "--out", tmp_path / "b")
@@ -112,7 +138,9 @@ def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(output_of, mon
 
 def test_a_folder_with_further_tables_shows_them(tmp_path):
     folder = write_folder(tmp_path / "out", [made_up_row("a")], [])
-    pd.DataFrame({"claim": ["converges faster"], "answer": ["not reproduced"]}).to_csv(folder / "claims.csv")
+    pd.DataFrame({"claim": ["converges faster"], "answer": ["not reproduced"]}).to_csv(
+        folder / "claims.csv"
+    )
     page = report.write_report(folder, tmp_path / "page.html").read_text()
     assert "not reproduced" in page
     assert not (folder / report.NAME).exists()
@@ -126,7 +154,9 @@ def test_a_folder_that_cannot_be_reported_is_one_line(refusal_of, tmp_path):
 
 def test_a_page_that_cannot_be_written_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(report, "_page", lambda folder, runs: "page")
-    with pytest.raises(ConfigurationError, match=r"report .*none/page.html cannot be written: No such file"):
+    with pytest.raises(
+        ConfigurationError, match=r"report .*none/page.html cannot be written: No such file"
+    ):
         report.write_report(comparison(tmp_path / "out"), tmp_path / "none" / "page.html")
 
 

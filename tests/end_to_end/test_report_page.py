@@ -14,7 +14,9 @@ from servobench.harness.batch import results
 from servobench.harness.pictures import report
 from servobench.harness.pictures.style import NARROW, TEXT, WIDE, method_styles
 
-pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
+pytestmark = pytest.mark.skipif(
+    find_browser() is None, reason="no Chromium: the report is not opened in a browser"
+)
 
 WIDTHS = (390, 1024, 1600)
 SMALLEST_TYPE = TEXT - 2.0  # [pt]
@@ -71,7 +73,11 @@ def long_names(folder):
     rows = []
     for seed in range(2):
         for k, name in enumerate(names):
-            values = {"controller": name, "seed": seed, "mismatch": "camera_rotation=30deg+links=5%+tool=20mm"}
+            values = {
+                "controller": name,
+                "seed": seed,
+                "mismatch": "camera_rotation=30deg+links=5%+tool=20mm",
+            }
             rows.append(made_up_row(f"{k}-{seed}", **values))
             lost = {
                 "status": "crashed",
@@ -79,7 +85,9 @@ def long_names(folder):
                 "reason": "KeyError: 'x' " * 20,
                 "settling_time_s": np.nan,
             }
-            rows.append(made_up_row(f"{k}-lost-{seed}", task="a_task_with_a_long_name", **values, **lost))
+            rows.append(
+                made_up_row(f"{k}-lost-{seed}", task="a_task_with_a_long_name", **values, **lost)
+            )
     return write_folder(folder, rows, [made_up_steps(row["run_id"]) for row in rows[::2]])
 
 
@@ -101,11 +109,21 @@ def browser(tmp_path_factory):
 
 def show(browser, path, width=1024, scheme="light"):
     browser.events.clear()
-    browser.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
-    browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    browser.call(
+        "Emulation.setDeviceMetricsOverride",
+        width=width,
+        height=900,
+        deviceScaleFactor=1,
+        mobile=False,
+    )
+    browser.call(
+        "Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}]
+    )
     browser.call("Page.navigate", url="about:blank")
     browser.open(path)
-    browser.wait_for("document.getElementById('count') && document.getElementById('count').textContent")
+    browser.wait_for(
+        "document.getElementById('count') && document.getElementById('count').textContent"
+    )
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -115,7 +133,8 @@ def test_nothing_is_cut_or_broken_or_wider_than_the_window(browser, pages, name,
     assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert browser.evaluate(TOO_WIDE) == []
     assert browser.evaluate(BROKEN_WORDS) == []
-    assert width != WIDTHS[0] or browser.evaluate(UNLEVEL) == []  # the values of a card stand on one line
+    # The values of a card stand on one line
+    assert width != WIDTHS[0] or browser.evaluate(UNLEVEL) == []
     assert browser.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)")
     assert browser.complaints() == []
     assert browser.requests() == []
@@ -146,7 +165,9 @@ def test_no_scale_of_paths_in_space_covers_another(browser, pages, width):
 @pytest.mark.parametrize("name", ["comparison", "long_names", "sweep"])
 def test_the_smallest_type_of_every_figure_can_be_read(browser, pages, name, width):
     show(browser, pages[name], width)
-    drawn = "Array.from(document.querySelectorAll('figure img'), i => [i.clientWidth, i.naturalWidth])"
+    drawn = (
+        "Array.from(document.querySelectorAll('figure img'), i => [i.clientWidth, i.naturalWidth])"
+    )
     layout = NARROW if width < 900 else WIDE
     shown = browser.evaluate(drawn)
     assert shown
@@ -155,10 +176,14 @@ def test_the_smallest_type_of_every_figure_can_be_read(browser, pages, name, wid
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_no_word_of_a_programming_language_stands_in_a_page_and_every_link_leads_somewhere(browser, pages, name):
+def test_no_word_of_a_programming_language_stands_in_a_page_and_every_link_leads_somewhere(
+    browser, pages, name
+):
     show(browser, pages[name])
     assert FOREIGN_WORDS.findall(browser.evaluate(SHOWN_TEXT)) == []
-    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', pages[name].read_text())
+    data = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>', pages[name].read_text()
+    )
     assert "NaN" not in data[1]
     assert "Infinity" not in data[1]
 
@@ -173,7 +198,9 @@ def test_no_word_of_a_programming_language_stands_in_a_page_and_every_link_leads
 def test_the_result_comes_first(browser, pages):
     show(browser, pages["comparison"], 390)
     assert browser.evaluate("document.querySelector('h1').getBoundingClientRect().top") < 150
-    assert "settled or followed the curve" in browser.evaluate("document.querySelector('h1').textContent")
+    assert "settled or followed the curve" in browser.evaluate(
+        "document.querySelector('h1').textContent"
+    )
 
 
 def test_contents_stay_beside_a_wide_page_and_fold_above_a_narrow_one(browser, pages):
@@ -197,9 +224,16 @@ def test_a_link_to_a_run_opens_its_curve_and_measures(browser, pages):
     text = browser.evaluate("document.querySelector('tr.detail').innerText")
     assert "kinematic-ukf_mfac-exp1-moderate-0" in text
     assert "settling time [s]" in text
-    assert browser.evaluate("document.querySelector('tr.detail path.own').getAttribute('d').split('L').length") > 30
+    assert (
+        browser.evaluate(
+            "document.querySelector('tr.detail path.own').getAttribute('d').split('L').length"
+        )
+        > 30
+    )
     browser.evaluate("location.hash = '#run-2'")
-    browser.wait_for("document.querySelector('tr.detail h4').textContent.includes('someone_elses-exp1')")
+    browser.wait_for(
+        "document.querySelector('tr.detail h4').textContent.includes('someone_elses-exp1')"
+    )
     assert browser.complaints() == []
 
 
@@ -208,7 +242,9 @@ def test_the_address_of_a_run_can_be_sent_to_somebody(browser, pages):
     browser.call("Page.navigate", url="about:blank")
     browser.call("Page.navigate", url=pages["comparison"].resolve().as_uri() + "#run-5")
     browser.wait_for("document.querySelector('tr.detail svg path.own')")
-    opened = browser.evaluate("Array.from(document.querySelectorAll('tr.detail h4'), h => h.textContent)")
+    opened = browser.evaluate(
+        "Array.from(document.querySelectorAll('tr.detail h4'), h => h.textContent)"
+    )
     assert opened == ["kinematic-someone_elses-circle-moderate-0"]
 
 
@@ -216,7 +252,9 @@ def test_a_run_without_steps_says_so(browser, pages):
     show(browser, pages["sweep"])
     browser.evaluate("document.querySelector('#run-3 a').click()")
     browser.wait_for("document.querySelector('tr.detail')")
-    assert "steps of this run are not in the page" in browser.evaluate("document.querySelector('tr.detail').innerText")
+    assert "steps of this run are not in the page" in browser.evaluate(
+        "document.querySelector('tr.detail').innerText"
+    )
 
 
 def test_the_runs_can_be_filtered_sorted_and_shown_all(browser, pages):
@@ -229,11 +267,15 @@ def test_the_runs_can_be_filtered_sorted_and_shown_all(browser, pages):
     browser.evaluate("filter.value = 'UKF lost'; filter.dispatchEvent(new Event('input'))")
     assert browser.evaluate("document.getElementById('count').textContent") == "5 of 54 runs"
     browser.evaluate("filter.value = ''; filter.dispatchEvent(new Event('input'))")
-    names = browser.evaluate("Array.from(document.querySelectorAll('#run-table .heads th'), h => h.textContent)")
+    names = browser.evaluate(
+        "Array.from(document.querySelectorAll('#run-table .heads th'), h => h.textContent)"
+    )
     seed, outcome = names.index("seed"), names.index("outcome")
     for column, wanted in ((seed, ["0", "5"]), (outcome, ["feature_lost", "settled"])):
         for order in (wanted, wanted[::-1]):
-            browser.evaluate(f"document.querySelectorAll('#run-table .heads button')[{column}].click()")
+            browser.evaluate(
+                f"document.querySelectorAll('#run-table .heads button')[{column}].click()"
+            )
             found = browser.evaluate(cells.replace("CELL", str(column)))
             assert [found[0], found[-1]] == order
     browser.evaluate(f"document.querySelectorAll('#run-table .heads button')[{outcome}].click()")
@@ -242,7 +284,10 @@ def test_the_runs_can_be_filtered_sorted_and_shown_all(browser, pages):
 
 def test_an_infinite_time_sorts_behind_all_numbers(browser, tmp_path):
     times = (2.0, np.nan, 0.5)
-    rows = [made_up_row(name, controller=name, settling_time_s=t) for name, t in zip("abc", times, strict=True)]
+    rows = [
+        made_up_row(name, controller=name, settling_time_s=t)
+        for name, t in zip("abc", times, strict=True)
+    ]
     show(browser, report.write_report(write_folder(tmp_path / "out", rows, [])))
     heads = "Array.from(document.querySelectorAll('#moves-1 + .sheet .heads button'))"
     browser.evaluate(f"{heads}.find(b => b.textContent.startsWith('settling time')).click()")
@@ -274,11 +319,15 @@ def test_paths_turn_and_names_switch_them_off(browser, pages):
 
 
 def test_dark_is_dark_and_light_on_it_can_be_read(browser, pages):
-    look = "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
+    look = (
+        "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
+    )
     brightness = {}
     for scheme in ("light", "dark"):
         show(browser, pages["comparison"], scheme=scheme)
-        brightness[scheme] = [sum(map(int, re.findall(r"\d+", colour))) for colour in browser.evaluate(look)]
+        brightness[scheme] = [
+            sum(map(int, re.findall(r"\d+", colour))) for colour in browser.evaluate(look)
+        ]
         inverted = browser.evaluate("getComputedStyle(document.querySelector('img.drawn')).filter")
         assert inverted.startswith("invert") == (scheme == "dark")
     assert brightness["light"][0] > 700 > 300 > brightness["light"][1]
@@ -299,16 +348,25 @@ def test_every_colour_of_a_method_can_be_told_from_the_dark_page(browser, pages)
 
 def luminance(colour):
     """Return the relative luminance that WCAG 2 compares, with its offset."""
-    linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in np.array(colour) / 255]
+    linear = [
+        c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in np.array(colour) / 255
+    ]
     return np.dot([0.2126, 0.7152, 0.0722], linear) + 0.05
 
 
 def test_on_paper_tables_are_tables_and_controls_are_gone(browser, pages):
     show(browser, pages["comparison"])
     browser.call("Emulation.setEmulatedMedia", media="print", features=[])
-    browser.call("Emulation.setDeviceMetricsOverride", width=695, height=1000, deviceScaleFactor=1, mobile=False)
+    browser.call(
+        "Emulation.setDeviceMetricsOverride",
+        width=695,
+        height=1000,
+        deviceScaleFactor=1,
+        mobile=False,
+    )
     assert (
-        browser.evaluate("getComputedStyle(document.querySelector('table.many thead')).display") == "table-header-group"
+        browser.evaluate("getComputedStyle(document.querySelector('table.many thead')).display")
+        == "table-header-group"
     )
     assert browser.evaluate("getComputedStyle(document.querySelector('nav')).display") == "none"
     assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth")
@@ -341,7 +399,9 @@ def test_hostile_texts_stay_texts(browser, tmp_path):
 
 def test_the_policy_of_the_page_stops_a_script_that_is_not_its_own(browser, pages, tmp_path):
     path = tmp_path / "page.html"
-    path.write_text(pages["one_run"].read_text().replace("</main>", "<script>window.pwned = 1</script></main>"))
+    path.write_text(
+        pages["one_run"].read_text().replace("</main>", "<script>window.pwned = 1</script></main>")
+    )
     show(browser, path)
     assert browser.evaluate("window.pwned") is None
     assert any("Content Security Policy" in complaint for complaint in browser.complaints())

@@ -67,7 +67,10 @@ class Tags(HTMLParser):
 def page_with(text: str, folder) -> str:
     """Return the report on a folder of which every text is `text`: in the manifest, the tables and beside them."""
     plain = made_up_row("a")
-    texts = {name: text for name, value in plain.items() if isinstance(value, str)} | {"outcome": text, "robot": text}
+    texts = {name: text for name, value in plain.items() if isinstance(value, str)} | {
+        "outcome": text,
+        "robot": text,
+    }
     rows = [plain | texts | {"run_id": f"a{k}", "seed": k} for k in range(2)]
     rows.append(made_up_row("ends-well", reason=text, mismatch=text, seed=5))
     write_folder(folder, rows, [])

@@ -29,7 +29,9 @@ SWEEP = (
 )  # fmt: skip
 RESUMERS = 12
 
-linux = pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the library that breaks files is for Linux")
+linux = pytest.mark.skipif(
+    not Path("/proc/self/fd").exists(), reason="the library that breaks files is for Linux"
+)
 
 
 def in_child(work) -> int:
@@ -39,7 +41,11 @@ def in_child(work) -> int:
     try:
         work()
     except BaseException as error:  # noqa: BLE001 - the parent judges by the exit code
-        os._exit(2 if isinstance(error, ConfigurationError) and "is being written by process" in str(error) else 3)
+        os._exit(
+            2
+            if isinstance(error, ConfigurationError) and "is being written by process" in str(error)
+            else 3
+        )
     os._exit(0)
 
 
@@ -52,11 +58,15 @@ def test_a_sweep_that_is_resumed_while_it_runs_is_refused_by_name_and_not_distur
     os.kill(first.pid, signal.SIGSTOP)  # it holds the folder, however fast the machine is
     for _ in range(3):
         error = refusal_of(*SWEEP, "--out", out, "--resume")
-        assert error.startswith(f"servobench: results folder {out} is being written by process {first.pid} of ")
+        assert error.startswith(
+            f"servobench: results folder {out} is being written by process {first.pid} of "
+        )
     assert servobench(monkeypatch, "collect", str(out)) == 2
     os.killpg(first.pid, signal.SIGKILL)
     finish(first)
-    assert f"was left by process {first.pid} of" in " ".join(output_of(*SWEEP, "--out", out, "--resume").split())
+    assert f"was left by process {first.pid} of" in " ".join(
+        output_of(*SWEEP, "--out", out, "--resume").split()
+    )
     runs = results.load_runs(out)
     assert len(runs) == 400
     assert runs["run_id"].is_unique
@@ -66,7 +76,9 @@ def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refu
     out, chance = tmp_path / "out", random.Random(1)
     how = Execution(workers=1, block=4, resume=True, bounds=Bounds(isolate=False))
     batch = file_faults.campaign(False, ("constant",), 40)
-    carry_out(batch, tmp_path / "alone", Execution(workers=1, block=4, bounds=Bounds(isolate=False)))
+    carry_out(
+        batch, tmp_path / "alone", Execution(workers=1, block=4, bounds=Bounds(isolate=False))
+    )
     out.mkdir()
 
     def resume(wait: float) -> None:
@@ -90,7 +102,9 @@ def test_a_process_that_is_refused_waits_for_the_name_of_one_that_has_just_taken
         late = threading.Timer(0.2, file.write_text, (name,))
         late.start()
         with (
-            pytest.raises(ConfigurationError, match=f"is being written by process {os.getpid()} of"),
+            pytest.raises(
+                ConfigurationError, match=f"is being written by process {os.getpid()} of"
+            ),
             lock.locked(tmp_path),
         ):
             pass
@@ -108,8 +122,13 @@ def test_a_lock_that_is_given_back_while_its_name_is_awaited_is_taken(tmp_path):
         end.join()
 
 
-def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed(tmp_path, monkeypatch):
-    out, how = tmp_path / "out", Execution(workers=1, block=4, resume=True, bounds=Bounds(isolate=False))
+def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed(
+    tmp_path, monkeypatch
+):
+    out, how = (
+        tmp_path / "out",
+        Execution(workers=1, block=4, resume=True, bounds=Bounds(isolate=False)),
+    )
     batch, locked = file_faults.campaign(False, ("constant",), 4), campaign.locked
     out.mkdir()
 
@@ -131,7 +150,9 @@ def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed
     ("--steps", "--runs", "4", "--every", "65"),
     ("--caches", "--every", "31"),
 ])  # fmt: skip
-def test_a_batch_and_caches_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(tmp_path, arguments):
+def test_a_batch_and_caches_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(
+    tmp_path, arguments
+):
     figures = file_faults.start(tmp_path, *arguments, timeout=550)
     assert figures["failed"] == [], figures
     assert figures["points"] >= 10
@@ -151,12 +172,24 @@ def test_a_folder_that_is_removed_while_it_is_written_is_one_line(tmp_path):
 
 def test_what_verify_says_can_be_done(refusal_of, output_of, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    sweep = ("sweep", "--controllers", "constant", "--seeds", "3", "--workers", "1", "--set", "random.duration=1")
+    sweep = (
+        "sweep",
+        "--controllers",
+        "constant",
+        "--seeds",
+        "3",
+        "--workers",
+        "1",
+        "--set",
+        "random.duration=1",
+    )
     assert servobench(monkeypatch, *sweep, "--out", str(out)) == 0
     assert "2 files are as they were written, 3 runs" in output_of("verify", out)
     (out / results.RUNS).write_bytes((out / results.RUNS).read_bytes()[:-100])
     printed = output_of("verify", out, code=1)
-    assert "runs.parquet is cut off: repeat the command that made the folder with --resume" in printed
+    assert (
+        "runs.parquet is cut off: repeat the command that made the folder with --resume" in printed
+    )
     for command in ("statistics", "report", "collect"):
         assert f"{out / results.RUNS} is cut off; repeat" in refusal_of(command, out)
     assert servobench(monkeypatch, *sweep, "--out", str(out), "--resume") == 0

@@ -30,7 +30,9 @@ def four(tmp_path):
     return str(path)
 
 
-def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(output_of, monkeypatch, capsys, tmp_path):
+def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(
+    output_of, monkeypatch, capsys, tmp_path
+):
     path = tmp_path / "panda.fmu"
     arguments = "--robot", "panda", "--mismatch", "moderate", "--seed", "3", "-o", str(path)
     assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
@@ -39,16 +41,24 @@ def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(output_of, mo
     capsys.readouterr()
     shown = output_of("fmu", "info", path)
     assert "Panda with mismatched kinematics" in shown
-    assert "capabilities in co-simulation: canNotUseMemoryManagementFunctions, canGetAndSet" in " ".join(shown.split())
+    assert (
+        "capabilities in co-simulation: canNotUseMemoryManagementFunctions, canGetAndSet"
+        in " ".join(shown.split())
+    )
     assert "joint_offset[7]" in shown
     assert "no problem found" in output_of("fmu", "validate", path)
 
 
-def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(monkeypatch, tmp_path):
+def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(
+    monkeypatch, tmp_path
+):
     path = tmp_path / "ur5.fmu"
     arguments = "--fmi", "3", "--mismatch", "severe", "--seed", "3", "-o", str(path)
     assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
-    start = {variable.name: variable.start for variable in read_information(path).description.modelVariables}
+    start = {
+        variable.name: variable.start
+        for variable in read_information(path).description.modelVariables
+    }
     run = build(resolve(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings()))
     exported = np.array(start["joint_offset"].split(), dtype=float)
     np.testing.assert_allclose(exported, run.drawn.sample.joint_offset, rtol=1e-12)
@@ -58,7 +68,9 @@ def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(mo
 def test_an_arm_is_the_same_as_fmu_and_in_numpy(name, request):
     robot = name if name == "panda" else request.getfixturevalue(name)
     runs = [
-        run_experiment(RunRequest(plant, "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
+        run_experiment(
+            RunRequest(plant, "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT
+        )
         for plant in ("kinematic", "fmu")
     ]
     features = [run.steps.filter(regex="^true_feature_").to_numpy() for run in runs]
@@ -72,7 +84,9 @@ def test_a_rendered_arm_settles_and_can_be_shown(name, request):
     from servobench.harness.pictures.replay import Replay, logged_run
 
     robot = name if name == "panda" else request.getfixturevalue(name)
-    result = run_experiment(RunRequest("bullet", "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
+    result = run_experiment(
+        RunRequest("bullet", "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT
+    )
     assert (result.row["outcome"], result.row["reason"]) == ("settled", "")
     shown = logged_run(result.row, result.steps)
     with Replay(shown) as replay:

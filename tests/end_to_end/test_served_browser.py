@@ -12,7 +12,9 @@ from kit.browser import browser_page, find_browser
 from kit.served import SPEED, packed, served, waited_for
 from servobench.harness.serve.server import PORTS
 
-pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium: no page attacks a served plant")
+pytestmark = pytest.mark.skipif(
+    find_browser() is None, reason="no Chromium: no page attacks a served plant"
+)
 SCRIPT = "\nend\ndef rtde_control():\n  pass\nend\n"
 PAGE = """<!doctype html><title>attack</title>
 <script>
@@ -47,14 +49,21 @@ addEventListener("load", () => { for (const port of [30004, 30003, 29999, 30020]
 
 @pytest.mark.slow
 def test_a_page_of_a_browser_moves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("servobench.harness.serve.server.script_version", lambda _: ("a test", True))
+    monkeypatch.setattr(
+        "servobench.harness.serve.server.script_version", lambda _: ("a test", True)
+    )
     move = packed("I", ",".join(SPEED).encode())
     move += packed("U", b"\x01" + struct.pack(">i8d", 1, *[0.5] * 6, 1.0, 1.0))
     (tmp_path / "site").mkdir()
-    pages = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=tmp_path / "site"))
+    pages = ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=tmp_path / "site")
+    )
     threading.Thread(target=pages.serve_forever, daemon=True).start()
     try:
-        with served(lockstep=False) as (server, address, lines), browser_page(tmp_path / "profile") as page:
+        with (
+            served(lockstep=False) as (server, address, lines),
+            browser_page(tmp_path / "profile") as page,
+        ):
             server.program.begin()
             before = server.rollout.observation.joint_position
             text = PAGE % {"host": address, "move": list(move), "script": repr(SCRIPT)}
@@ -63,7 +72,9 @@ def test_a_page_of_a_browser_moves_nothing(tmp_path, monkeypatch):
 
             def is_refused():
                 """Return whether each port has refused a fetch in the clear, one by TLS, a WebSocket and a form."""
-                counts = {port: sum(line.startswith(f"{port}: ") for line in lines) for port in PORTS}
+                counts = {
+                    port: sum(line.startswith(f"{port}: ") for line in lines) for port in PORTS
+                }
                 return counts["RTDE"] >= 12 and min(counts.values()) >= 4
 
             refused = waited_for(is_refused, 60.0)

@@ -45,12 +45,16 @@ def test_every_combination_is_a_row_and_says_where_it_stands(undisturbed):
     assert set(table["unit"]) == {"deg"}
     assert set(table["noise_factor"]) == {1.0, 2.0}
     assert set(table["period_s"]) == {0.1}
-    assert set(table["mismatch"]) == {f"moderate+camera_rotation={angle}deg" for angle in (0, 20, 40)}
+    assert set(table["mismatch"]) == {
+        f"moderate+camera_rotation={angle}deg" for angle in (0, 20, 40)
+    }
     assert not (undisturbed / results.PARTS).exists()
     assert not (undisturbed / results.STEPS).exists()
 
 
-def test_a_killed_sweep_that_is_resumed_gives_the_table_of_an_undisturbed_one(undisturbed, tmp_path, monkeypatch):
+def test_a_killed_sweep_that_is_resumed_gives_the_table_of_an_undisturbed_one(
+    undisturbed, tmp_path, monkeypatch
+):
     out = tmp_path / "killed"
     process = start(*SWEEP, "--out", str(out))
     wait_for(lambda: part_count(out) > 0)
@@ -65,7 +69,10 @@ def parts(tmp_path, monkeypatch, count: int, chosen: Iterable[int]) -> list[str]
     folders = [str(tmp_path / f"{number}") for number in chosen]
     for folder in folders:
         division = f"{Path(folder).name}/{count}"
-        assert servobench(monkeypatch, *SWEEP, "--workers", "1", "--part", division, "--out", folder) == 0
+        assert (
+            servobench(monkeypatch, *SWEEP, "--workers", "1", "--part", division, "--out", folder)
+            == 0
+        )
     return folders
 
 
@@ -80,10 +87,17 @@ def test_parts_are_merged_into_the_table_of_an_undivided_sweep(undisturbed, tmp_
     assert servobench(monkeypatch, "verify", str(tmp_path / "merged")) == 0
 
 
-def test_a_folder_that_goes_on_with_other_parts_has_each_run_once(undisturbed, tmp_path, monkeypatch):
+def test_a_folder_that_goes_on_with_other_parts_has_each_run_once(
+    undisturbed, tmp_path, monkeypatch
+):
     folder = str(tmp_path / "out")
     for part in ("2/3", "1/2", "3/4", "2/2"):
-        assert servobench(monkeypatch, *SWEEP, "--workers", "1", "--part", part, "--out", folder, "--resume") == 0
+        assert (
+            servobench(
+                monkeypatch, *SWEEP, "--workers", "1", "--part", part, "--out", folder, "--resume"
+            )
+            == 0
+        )
     assert_same_runs(tmp_path / "out", undisturbed)
 
 
@@ -91,14 +105,20 @@ def test_runs_of_a_part_that_is_missing_are_carried_out_in_the_merged_folder(
     output_of, undisturbed, tmp_path, monkeypatch
 ):
     folders, merged = parts(tmp_path, monkeypatch, 3, (1, 3)), str(tmp_path / "merged")
-    assert "32 of 48 runs are there: --resume carries out the others" in output_of("merge", *folders, "--out", merged)
+    assert "32 of 48 runs are there: --resume carries out the others" in output_of(
+        "merge", *folders, "--out", merged
+    )
     assert servobench(monkeypatch, *SWEEP, "--workers", "1", "--out", merged, "--resume") == 0
     assert_same_runs(tmp_path / "merged", undisturbed)
 
 
-def test_folders_that_are_no_parts_of_one_batch_are_not_merged(refusal_of, undisturbed, tmp_path, monkeypatch, capsys):
+def test_folders_that_are_no_parts_of_one_batch_are_not_merged(
+    refusal_of, undisturbed, tmp_path, monkeypatch, capsys
+):
     part, other = *parts(tmp_path, monkeypatch, 3, (1,)), str(tmp_path / "other")
-    servobench(monkeypatch, *SWEEP, "--seeds", "5", "--workers", "1", "--part", "1/9", "--out", other)
+    servobench(
+        monkeypatch, *SWEEP, "--seeds", "5", "--workers", "1", "--part", "1/9", "--out", other
+    )
     capsys.readouterr()
     wrong = {
         part: "have the same runs: leave one away",
@@ -116,7 +136,9 @@ def test_a_part_that_there_is_not_is_refused(refusal_of, part, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(undisturbed, tmp_path, monkeypatch):
+def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(
+    undisturbed, tmp_path, monkeypatch
+):
     out = tmp_path / "half"
     results.create_folder(out, results.read_manifest(undisturbed))
     rows = results.load_runs(undisturbed).to_dict("records")
@@ -128,9 +150,21 @@ def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(undisturbed, tm
     assert_same_runs(out, undisturbed)
 
 
-def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single_runs(output_of, monkeypatch, tmp_path):
+def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single_runs(
+    output_of, monkeypatch, tmp_path
+):
     out, alone = tmp_path / "periods", tmp_path / "alone"
-    common = ("sweep", "--controllers", "rbf_pid", "--seeds", "2", "--workers", "1", "--set", "random.duration=1")
+    common = (
+        "sweep",
+        "--controllers",
+        "rbf_pid",
+        "--seeds",
+        "2",
+        "--workers",
+        "1",
+        "--set",
+        "random.duration=1",
+    )
     assert "50" in output_of(*common, "--period", "0.05,0.02", "--out", out)
     assert servobench(monkeypatch, *common, "--set", "run.period=0.02", "--out", str(alone)) == 0
     table, fast = results.load_runs(out), judged(results.load_runs(alone))
@@ -141,13 +175,27 @@ def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single
     assert drawn.tolist() == [1, 1]
     own = ["run_id", "period_s"]
     pd.testing.assert_frame_equal(
-        judged(table).iloc[2:].drop(columns=own).reset_index(drop=True), fast.drop(columns=own), check_exact=True
+        judged(table).iloc[2:].drop(columns=own).reset_index(drop=True),
+        fast.drop(columns=own),
+        check_exact=True,
     )
 
 
-def test_any_setting_can_be_varied_and_is_a_column_with_the_rows_of_single_runs(output_of, monkeypatch, tmp_path):
+def test_any_setting_can_be_varied_and_is_a_column_with_the_rows_of_single_runs(
+    output_of, monkeypatch, tmp_path
+):
     out, alone = tmp_path / "varied", tmp_path / "alone"
-    common = ("sweep", "--controllers", "rbf_pid", "--seeds", "2", "--workers", "1", "--set", "random.duration=1")
+    common = (
+        "sweep",
+        "--controllers",
+        "rbf_pid",
+        "--seeds",
+        "2",
+        "--workers",
+        "1",
+        "--set",
+        "random.duration=1",
+    )
     varied = ("--vary", "kinematic.lag=0.02,0.1", "--vary", "plant.sensing.noise=white,uniform")
     assert "plant.lag" in output_of(*common, *varied, "--out", out)
     single = ("--set", "kinematic.lag=0.1", "--set", "kinematic.sensing.noise=uniform")
@@ -157,14 +205,18 @@ def test_any_setting_can_be_varied_and_is_a_column_with_the_rows_of_single_runs(
     assert table["plant.sensing.noise"].tolist() == ["white", "white", "uniform", "uniform"] * 2
     own = ["run_id", "plant.lag", "plant.sensing.noise"]
     pd.testing.assert_frame_equal(
-        table.iloc[6:].drop(columns=own).reset_index(drop=True), last.drop(columns="run_id"), check_exact=True
+        table.iloc[6:].drop(columns=own).reset_index(drop=True),
+        last.drop(columns="run_id"),
+        check_exact=True,
     )
 
 
 def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(refusal_of, undisturbed):
     assert "exists already" in refusal_of(*SWEEP, "--out", undisturbed)
     for other in (("--seeds", "5"), ("--set", "kinematic.lag=0.03")):
-        assert "holds results of other runs or settings" in refusal_of(*SWEEP, *other, "--out", undisturbed, "--resume")
+        assert "holds results of other runs or settings" in refusal_of(
+            *SWEEP, *other, "--out", undisturbed, "--resume"
+        )
 
 
 def test_variations_are_put_on_top_of_the_mismatch_one_by_one():

@@ -5,7 +5,13 @@ import struct
 
 import pytest
 
-from servobench.fmus.compiler import PLATFORMS, CompilerMissing, compile_library, library_files, this_platform
+from servobench.fmus.compiler import (
+    PLATFORMS,
+    CompilerMissing,
+    compile_library,
+    library_files,
+    this_platform,
+)
 
 SOURCE = "#ifndef ANSWER\n#error no answer\n#endif\nint answer(void) { return ANSWER; }\n"
 
@@ -32,7 +38,9 @@ MAC = {
 
 
 def files(*names: str, version: int = 2):
-    return library_files({PLATFORMS[name]: MAC.get(name, name.encode()) for name in names}, "arm", version)
+    return library_files(
+        {PLATFORMS[name]: MAC.get(name, name.encode()) for name in names}, "arm", version
+    )
 
 
 def test_macos_finds_a_library_for_both_processors_where_fmi_2_has_one_folder():
@@ -52,7 +60,10 @@ def test_macos_finds_a_library_for_both_processors_where_fmi_2_has_one_folder():
 
 
 def test_an_fmu_for_arm_linux_alone_is_found_where_importers_of_fmi_2_look():
-    alone = {"binaries/aarch64-linux/arm.so": b"aarch64-linux", "binaries/linux64/arm.so": b"aarch64-linux"}
+    alone = {
+        "binaries/aarch64-linux/arm.so": b"aarch64-linux",
+        "binaries/linux64/arm.so": b"aarch64-linux",
+    }
     assert files("aarch64-linux") == alone
     assert files("aarch64-linux", "x86_64-linux")["binaries/linux64/arm.so"] == b"x86_64-linux"
     assert list(files("aarch64-linux", version=3)) == ["binaries/aarch64-linux/arm.so"]

@@ -55,7 +55,11 @@ class Opened:
         for k in range(knowns.values.size):
             knowns.values[:] = np.eye(knowns.values.size)[k]
             ports = knowns, unknowns
-            buffers = [place for port in ports for place in self.instance._buffer(port.pointer(), port.values.size)]
+            buffers = [
+                place
+                for port in ports
+                for place in self.instance._buffer(port.pointer(), port.values.size)
+            ]
             places = *unknowns.variables, *knowns.variables, *buffers
             self.instance.call("GetDirectionalDerivative", *places)
             columns.append(unknowns.values.copy())
@@ -71,8 +75,12 @@ class Opened:
 @pytest.mark.parametrize(("version", "mismatch"), [(2, "severe"), (3, "factory")])
 def test_the_fmu_agrees_with_the_kinematic_plant_over_five_hundred_random_steps(version, mismatch):
     common = {"feature_noise": 0.002, "latency": 0.05, "drop_probability": 0.1, "joint_range": 2.9}
-    plant = ENTRY.build(configure(Ur5FmuConfig, fmi_version=version, max_joint_speed=2.0, **common), setup(mismatch))
-    oracle = build_kinematic(configure(KinematicConfig, max_joint_speed=2.0, **common), setup(mismatch))
+    plant = ENTRY.build(
+        configure(Ur5FmuConfig, fmi_version=version, max_joint_speed=2.0, **common), setup(mismatch)
+    )
+    oracle = build_kinematic(
+        configure(KinematicConfig, max_joint_speed=2.0, **common), setup(mismatch)
+    )
     assert plant.spec.joint_names == oracle.spec.joint_names
     generator, stops = np.random.default_rng(1), 0
     pairs = [(plant.reset(7), oracle.reset(7))]
@@ -81,10 +89,16 @@ def test_the_fmu_agrees_with_the_kinematic_plant_over_five_hundred_random_steps(
         pairs.append((plant.step(command), oracle.step(command)))
         stops += np.count_nonzero(np.abs(pairs[-1][1].joint_position) == 2.9)
         if k % 20 == 0:
-            np.testing.assert_allclose(plant.truth().jacobian, oracle.truth().jacobian, rtol=0, atol=1e-9)
-            np.testing.assert_allclose(plant.truth().feature, oracle.truth().feature, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(
+                plant.truth().jacobian, oracle.truth().jacobian, rtol=0, atol=1e-9
+            )
+            np.testing.assert_allclose(
+                plant.truth().feature, oracle.truth().feature, rtol=0, atol=1e-9
+            )
     for name in ("time", "joint_position", "feature", "feature_valid"):
-        came, wanted = (np.array([getattr(pair[side], name) for pair in pairs], dtype=float) for side in (0, 1))
+        came, wanted = (
+            np.array([getattr(pair[side], name) for pair in pairs], dtype=float) for side in (0, 1)
+        )
         np.testing.assert_allclose(came, wanted, rtol=0, atol=1e-9, err_msg=name)
     assert stops > 0
     plant.close()
@@ -93,7 +107,9 @@ def test_the_fmu_agrees_with_the_kinematic_plant_over_five_hundred_random_steps(
 def test_each_joint_may_have_a_lag_of_its_own():
     lags, quiet = (0.0, 0.02, 0.05, 0.1, 0.2, 1.0), {"feature_noise": 0.0, "command_delay": 0.0}
     plant = ENTRY.build(configure(Ur5FmuConfig, joint_lags=lags, **quiet), setup())
-    oracles = [KINEMATIC.build(configure(KinematicConfig, lag=lag, **quiet), setup()) for lag in lags]
+    oracles = [
+        KINEMATIC.build(configure(KinematicConfig, lag=lag, **quiet), setup()) for lag in lags
+    ]
     for each in (plant, *oracles):
         each.reset(0)
     for _ in range(20):
@@ -123,7 +139,9 @@ def test_encoders_round_the_joint_position_to_their_steps(version):
 
 def test_the_plant_reports_encoder_steps_and_judges_by_exact_positions():
     config = configure(Ur5FmuConfig, feature_noise=0.0)
-    coarse, exact = (ENTRY.build(replace(config, encoder_resolution=size), setup()) for size in (1e-2, 0.0))
+    coarse, exact = (
+        ENTRY.build(replace(config, encoder_resolution=size), setup()) for size in (1e-2, 0.0)
+    )
     coarse.reset(0), exact.reset(0)
     for _ in range(5):
         came, wanted = (plant.step(Command(np.full(6, 0.37))) for plant in (coarse, exact))
@@ -144,7 +162,9 @@ def test_many_small_steps_end_where_one_large_step_ends(version):
         for k in range(100):
             advance(k * 0.005)
         np.testing.assert_allclose(
-            often.get("joint_position", "joint_velocity"), once.get("joint_position", "joint_velocity"), atol=1e-12
+            often.get("joint_position", "joint_velocity"),
+            once.get("joint_position", "joint_velocity"),
+            atol=1e-12,
         )
 
 
@@ -160,14 +180,21 @@ def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(versio
         q = opened.get("joint_position")
         ball = opened.derivative("ball_position", "joint_position")
         np.testing.assert_allclose(ball, model.jacobian(q), rtol=0, atol=1e-9)
-        np.testing.assert_allclose(opened.get("jacobian").reshape(3, 6), model.jacobian(q), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            opened.get("jacobian").reshape(3, 6), model.jacobian(q), rtol=0, atol=1e-9
+        )
         hessian = opened.derivative("jacobian", "joint_position")
         step = 1e-6 * np.eye(6)
         differences = [(model.jacobian(q + d) - model.jacobian(q - d)).ravel() / 2e-6 for d in step]
         np.testing.assert_allclose(hessian, np.column_stack(differences), atol=1e-8)
-        lag = np.diag(1.0 / KinematicConfig().lag * np.array([1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))  # two are clipped
-        np.testing.assert_allclose(opened.derivative("der(joint_velocity)", "joint_velocity_command"), lag)
-        np.testing.assert_allclose(opened.derivative("der(joint_position)", "joint_velocity"), np.eye(6))
+        # Two are clipped
+        lag = np.diag(1.0 / KinematicConfig().lag * np.array([1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+        np.testing.assert_allclose(
+            opened.derivative("der(joint_velocity)", "joint_velocity_command"), lag
+        )
+        np.testing.assert_allclose(
+            opened.derivative("der(joint_position)", "joint_velocity"), np.eye(6)
+        )
 
 
 def assert_derivative(opened, unknown, known, **tolerances):
@@ -180,11 +207,14 @@ def assert_derivative(opened, unknown, known, **tolerances):
             ends.append(opened.get(unknown).copy())
         opened.set(known, value)
         message = f"{unknown} by {known}"
-        np.testing.assert_allclose(came[:, k], (ends[0] - ends[1]) / 2e-6, err_msg=message, **tolerances)
+        np.testing.assert_allclose(
+            came[:, k], (ends[0] - ends[1]) / 2e-6, err_msg=message, **tolerances
+        )
 
 
 @pytest.mark.parametrize(
-    "parameter", ["a", "alpha", "pitch", "joint_offset", "gear_ratio", "tool", "camera_rpy", "base_rpy"]
+    "parameter",
+    ["a", "alpha", "pitch", "joint_offset", "gear_ratio", "tool", "camera_rpy", "base_rpy"],
 )
 def test_derivatives_by_parameters_equal_differences(parameter):
     with Opened(2) as opened:
@@ -192,11 +222,24 @@ def test_derivatives_by_parameters_equal_differences(parameter):
 
 
 @pytest.mark.parametrize(
-    "known", ["a", "gear_ratio", "joint_velocity_command", "ripple", "ripple_order", "tool_frequency", "tool_damping"]
+    "known",
+    [
+        "a",
+        "gear_ratio",
+        "joint_velocity_command",
+        "ripple",
+        "ripple_order",
+        "tool_frequency",
+        "tool_damping",
+    ],
 )
 def test_derivatives_by_parameters_of_gears_and_tool_equal_differences(known):
     play = 0.0 if "ripple" in known else 0.02  # a gear that comes back leaves the joint where it is
-    values = {"backlash": np.full(6, play), "ripple": np.full(6, 0.03), "ripple_order": np.full(6, 7.0)}
+    values = {
+        "backlash": np.full(6, play),
+        "ripple": np.full(6, 0.03),
+        "ripple_order": np.full(6, 7.0),
+    }
     values |= {"tool_frequency": np.array([12.0]), "tool_damping": np.array([0.05])}
     commands = np.array([0.5, -0.4, 0.3, 0.1, -0.2, 0.3])
     with Opened(2, start=False) as opened:
@@ -246,7 +289,9 @@ def test_a_restored_state_gives_the_same_bits_here_and_in_another_process(versio
         assert run(plant, 30, 2) == wanted
     plant.close()
     task = pickle.dumps((version, setup("severe"), state))
-    done = subprocess.run([sys.executable, "-c", CONTINUE], input=task, capture_output=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", CONTINUE], input=task, capture_output=True, check=True
+    )
     assert done.stdout == b"".join(wanted)
 
 
@@ -312,10 +357,17 @@ def test_a_tool_made_rigid_or_flexible_within_a_run_is_where_a_rigid_one_is(vers
 def test_only_the_categories_of_the_last_call_are_logged(version, tmp_path):
     with Opened(version, log=tmp_path / "log") as opened:
         opened.set("joint_lower", opened.get("joint_position") - 0.01)
-        advance, flag = opened.instance.stepper(0.05), ctypes.c_int if version == 2 else ctypes.c_bool
+        advance, flag = (
+            opened.instance.stepper(0.05),
+            ctypes.c_int if version == 2 else ctypes.c_bool,
+        )
         found = []
-        for k, (on, category) in enumerate([(1, b"logStatusWarning"), (1, b"logEvents"), (0, b"logStatusWarning")]):
-            opened.instance.call("SetDebugLogging", flag(on), ctypes.c_size_t(1), (ctypes.c_char_p * 1)(category))
+        for k, (on, category) in enumerate(
+            [(1, b"logStatusWarning"), (1, b"logEvents"), (0, b"logStatusWarning")]
+        ):
+            opened.instance.call(
+                "SetDebugLogging", flag(on), ctypes.c_size_t(1), (ctypes.c_char_p * 1)(category)
+            )
             opened.set("joint_velocity_command", -1.0 if k < 2 else 1.0)
             advance(k * 0.05)
             found.append((tmp_path / "log").read_text())
@@ -344,5 +396,6 @@ def test_memory_stays_flat_over_a_thousand_instances(version):
         live(500)  # until the allocator has what it needs
         before = process.memory_info().rss
         live(1000)
-        assert process.memory_info().rss - before < 0.6e6  # one lost state an instance would be 1.2e6
+        # One lost state an instance would be 1.2e6
+        assert process.memory_info().rss - before < 0.6e6
         assert process.num_fds() == files

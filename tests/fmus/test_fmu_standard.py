@@ -124,12 +124,19 @@ def drive(version: int, kind: str, **options) -> tuple[np.ndarray, np.ndarray]:
         signal = np.zeros(4, dtype=[("time", float), *((name, float) for name in names)])
         for name in names:
             signal[name] = commands
-        start = {f"{name}[{i + 1}]": value for name, value in (("joint_upper", 0.1), ("home", 0.0)) for i in range(6)}
+        start = {
+            f"{name}[{i + 1}]": value
+            for name, value in (("joint_upper", 0.1), ("home", 0.0))
+            for i in range(6)
+        }
         outputs = ["joint_position[1]", "joint_velocity[1]"]
     else:
         signal = np.zeros(4, dtype=[("time", float), ("joint_velocity_command", float, (6,))])
         signal["joint_velocity_command"] = commands[:, None]
-        start, outputs = {"joint_upper": [0.1] * 6, "home": [0.0] * 6}, ["joint_position", "joint_velocity"]
+        start, outputs = (
+            {"joint_upper": [0.1] * 6, "home": [0.0] * 6},
+            ["joint_position", "joint_velocity"],
+        )
     signal["time"] = time
     result = simulate_fmu(
         str(cached_fmu(version)),
@@ -208,13 +215,19 @@ def test_adjoint_derivatives_are_the_transposed_product_of_the_directional_ones(
             arm.fmu.enterInitializationMode(startTime=0.0)
         else:
             arm.start()
-        arm.fmu.setFloat64(arm.references("joint_velocity_command"), [0.5, 2.0, -2.0, 0.1, 0.0, -0.3])
+        arm.fmu.setFloat64(
+            arm.references("joint_velocity_command"), [0.5, 2.0, -2.0, 0.1, 0.0, -0.3]
+        )
         if not starting:
             arm.step(0.0, 0.3)
         states = () if starting else ("joint_position", "joint_velocity")
-        knowns, unknowns = ([arm.references(name)[0] for name in names] for names in ((*KNOWNS, *states), UNKNOWNS))
+        knowns, unknowns = (
+            [arm.references(name)[0] for name in names] for names in ((*KNOWNS, *states), UNKNOWNS)
+        )
         n, m = sum(sizes((*KNOWNS, *states))), sum(sizes(UNKNOWNS))
-        matrix = [arm.fmu.getDirectionalDerivative(unknowns, knowns, row.tolist(), m) for row in np.eye(n)]
+        matrix = [
+            arm.fmu.getDirectionalDerivative(unknowns, knowns, row.tolist(), m) for row in np.eye(n)
+        ]
         seed = generator.standard_normal(m)
         came = arm.fmu.getAdjointDerivative(unknowns, knowns, seed.tolist(), n)
         assert np.count_nonzero(came) > n / 2
@@ -226,7 +239,9 @@ def test_one_adjoint_call_gives_a_row_of_the_jacobian_and_equals_differences():
         arm.start()
         arm.set("joint_velocity_command", 0.5)
         arm.step(0.0, 0.4)
-        ball, q, tool = (arm.references(name) for name in ("ball_position", "joint_position", "tool"))
+        ball, q, tool = (
+            arm.references(name) for name in ("ball_position", "joint_position", "tool")
+        )
         row = arm.fmu.getAdjointDerivative(ball, q, [0.0, 1.0, 0.0], 6)
         np.testing.assert_allclose(row, arm.get("jacobian").reshape(3, 6)[1], rtol=0, atol=1e-12)
         weights, at = np.array([0.3, -1.0, 0.7]), arm.get("tool")
@@ -241,19 +256,27 @@ def test_one_adjoint_call_gives_a_row_of_the_jacobian_and_equals_differences():
 
 @pytest.mark.parametrize(
     ("unknown", "known", "seed", "size"),
-    [("ball_position", "ball_position", 3, 3), ("ball_position", "tool", 2, 3), ("ball_position", "tool", 3, 4)],
+    [
+        ("ball_position", "ball_position", 3, 3),
+        ("ball_position", "tool", 2, 3),
+        ("ball_position", "tool", 3, 4),
+    ],
 )
 def test_adjoint_derivatives_of_what_does_not_fit_are_refused(unknown, known, seed, size):
     with Fmu(3) as arm:
         arm.start()
         with refused():
-            arm.fmu.getAdjointDerivative(arm.references(unknown), arm.references(known), [1.0] * seed, size)
+            arm.fmu.getAdjointDerivative(
+                arm.references(unknown), arm.references(known), [1.0] * seed, size
+            )
 
 
 def test_the_description_says_what_tools_ask_for():
     with zipfile.ZipFile(cached_fmu(3)) as archive:
         build = ET.fromstring(archive.read("sources/buildDescription.xml"))
-        references = ET.fromstring(archive.read("extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"))
+        references = ET.fromstring(
+            archive.read("extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml")
+        )
         for related in references.iter("Related"):
             assert "extra/" + related.attrib["source"].removeprefix("../") in archive.namelist()
     assert [each.attrib["name"] for each in build.iter("Library")] == ["m"]
@@ -262,7 +285,10 @@ def test_the_description_says_what_tools_ask_for():
     for version in VERSIONS:
         description = read_model_description(str(cached_fmu(version)))
         assert float(description.defaultExperiment.tolerance) == 1e-6
-        assert (description.numberOfContinuousStates, description.numberOfEventIndicators) == (18, 12)
+        assert (description.numberOfContinuousStates, description.numberOfEventIndicators) == (
+            18,
+            12,
+        )
         variables = {each.name.removesuffix("[1]"): each for each in description.modelVariables}
         assert float(variables["joint_velocity"].nominal) == 1.0
         assert variables["joint_position"].displayUnit == "deg"

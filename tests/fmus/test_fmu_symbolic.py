@@ -75,7 +75,9 @@ def quiet(path: Path) -> Settings:
 
 def ur5_model(version: int, parameters=None, joints=("joint_position",)) -> FmuModel:
     path = cached_fmu(version)
-    mapping = FmuMapping(path, ("joint_velocity_command",), ("ball_position",), joints, parameters=parameters or {})
+    mapping = FmuMapping(
+        path, ("joint_velocity_command",), ("ball_position",), joints, parameters=parameters or {}
+    )
     return build_model(mapping, read_description(path, extract_fmu(path)))
 
 
@@ -83,11 +85,15 @@ def test_casadi_reads_the_equations_of_the_ur5_back():
     parameters = parameters_of(setup("severe"), KinematicConfig())
     model = ur5_model(2, parameters)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (10, 6))
-    np.testing.assert_allclose(model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9
+    )
     feature = model.function(q[0])[0].full().ravel()
     np.testing.assert_allclose(feature, mismatched("severe").feature(q[0]), rtol=0, atol=1e-9)
     symbol = casadi.MX.sym("q", 6)
-    squared = casadi.Function("squared", [symbol], [casadi.gradient(casadi.sumsqr(model.symbolic(symbol)), symbol)])
+    squared = casadi.Function(
+        "squared", [symbol], [casadi.gradient(casadi.sumsqr(model.symbolic(symbol)), symbol)]
+    )
     wanted = 2.0 * mismatched("severe").jacobian(q[1]).T @ mismatched("severe").feature(q[1])
     np.testing.assert_allclose(np.asarray(squared(q[1])).ravel(), wanted, rtol=0, atol=1e-9)
 
@@ -99,13 +105,17 @@ def test_on_the_ur5_the_predictive_bound_commands_the_same_by_the_fmu_as_by_the_
     q = np.random.default_rng(1).uniform(-3.0, 3.0, (20, 6))
     np.testing.assert_allclose(model.jacobian(q), true.jacobian(q), rtol=0, atol=1e-9)
     by_fmu, by_equations = (
-        NmpcCalibrated(NmpcCalibratedConfig(), RobotKnowledge(plant.spec, 10, true_symbolic=symbolic))
+        NmpcCalibrated(
+            NmpcCalibratedConfig(), RobotKnowledge(plant.spec, 10, true_symbolic=symbolic)
+        )
         for symbolic in (model.symbolic, symbolic_feature(true))
     )
     observation = plant.reset(0)
     reference = np.tile(true.feature(np.array(HOME)) + [0.1, 0.05, 0.02], (11, 1))
     for _ in range(40):
-        commands = [each.step(observation, reference).joint_velocity for each in (by_fmu, by_equations)]
+        commands = [
+            each.step(observation, reference).joint_velocity for each in (by_fmu, by_equations)
+        ]
         np.testing.assert_allclose(*commands, rtol=0, atol=1e-9)
         observation = plant.step(Command(commands[0]))
     assert np.linalg.norm(plant.truth().feature - reference[0]) < 1e-6
@@ -127,7 +137,9 @@ def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_ar
     plant.reset(0)
     for command in ([1.0, -0.5], [0.3, 2.0]):
         q = plant.step(Command(command)).joint_position
-        np.testing.assert_allclose(plant.true_model().jacobian(q), crane_jacobian(q), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            plant.true_model().jacobian(q), crane_jacobian(q), rtol=0, atol=1e-12
+        )
         np.testing.assert_allclose(plant.truth().jacobian, crane_jacobian(q), rtol=0, atol=1e-12)
     plant.close()
     settings = Settings(quiet(path).sections | {"broyden": {"initial": {"source": "probe"}}})
@@ -143,11 +155,15 @@ def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
     experiment.controller.reset(observation, 0)
     experiment.controller.step(observation, np.tile([0.2, 0.7], (11, 1)))
     wanted = crane_jacobian(observation.joint_position, NOMINAL_ARM)
-    np.testing.assert_allclose(experiment.controller.estimated_jacobian(), wanted, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        experiment.controller.estimated_jacobian(), wanted, rtol=0, atol=1e-12
+    )
     experiment.plant.close()
     region = {"training": {"lower": [-0.5, 0.3], "upper": [1.5, 2.5]}}
     for controller in ("ukf_mfac", "rbfnn_mfac"):
-        row = run_experiment(request(path, controller), Settings(quiet(path).sections | {"rbfnn_mfac": region})).row
+        row = run_experiment(
+            request(path, controller), Settings(quiet(path).sections | {"rbfnn_mfac": region})
+        ).row
         assert row["status"] == "completed"
         assert row["steady_state_error"] < 2e-3
 
@@ -167,17 +183,42 @@ def test_fixed_parameters_reach_the_model_like_tunable_ones(tmp_path):
 @pytest.mark.parametrize(
     ("controller", "old", "new", "message"),
     [
-        ("calibrated", "<ModelExchange", "<Nothing", "crane.fmu offers no model exchange, so its Jacobian"),
-        ("nmpc_calibrated", "<ModelExchange", "<Nothing", "crane.fmu offers no model exchange, so its Jacobian"),
-        ("calibrated", 'Derivative="true"', 'Derivative="false"', "crane.fmu has no directional derivatives"),
+        (
+            "calibrated",
+            "<ModelExchange",
+            "<Nothing",
+            "crane.fmu offers no model exchange, so its Jacobian",
+        ),
+        (
+            "nmpc_calibrated",
+            "<ModelExchange",
+            "<Nothing",
+            "crane.fmu offers no model exchange, so its Jacobian",
+        ),
+        (
+            "calibrated",
+            'Derivative="true"',
+            'Derivative="false"',
+            "crane.fmu has no directional derivatives",
+        ),
         (
             "calibrated",
             '<ModelExchange modelIdentifier="crane"',
             '<ModelExchange modelIdentifier="crane" canBeInstantiatedOnlyOncePerProcess="true"',
             "crane.fmu allows one instance in a process",
         ),
-        ("calibrated", 'derivative="1"', "", "crane.fmu cannot be read by CasADi: Error processing derivative"),
-        ("calibrated", 'modelIdentifier="crane" p', 'modelIdentifier="boat" p', "crane.fmu cannot be read by CasADi"),
+        (
+            "calibrated",
+            'derivative="1"',
+            "",
+            "crane.fmu cannot be read by CasADi: Error processing derivative",
+        ),
+        (
+            "calibrated",
+            'modelIdentifier="crane" p',
+            'modelIdentifier="boat" p',
+            "crane.fmu cannot be read by CasADi",
+        ),
     ],
 )
 def test_where_the_fmu_cannot_tell_it_is_one_clear_line(tmp_path, controller, old, new, message):
@@ -192,11 +233,23 @@ def test_where_the_fmu_cannot_tell_it_is_one_clear_line(tmp_path, controller, ol
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MAPPING + NOMINAL.replace("arm.luff", "arm.lufff"), "nominal names 'arm.lufff', .*did you mean 'arm.luff'"),
-        (MAPPING + NOMINAL.replace("0.4", "[0.4, 0.4]"), "parameter 'arm.luff' must have 1 values, got 2"),
-        (MAPPING + STATES.replace("wheel.luff", "place.luff"), "'place.luff', which is none of the states of crane"),
+        (
+            MAPPING + NOMINAL.replace("arm.luff", "arm.lufff"),
+            "nominal names 'arm.lufff', .*did you mean 'arm.luff'",
+        ),
+        (
+            MAPPING + NOMINAL.replace("0.4", "[0.4, 0.4]"),
+            "parameter 'arm.luff' must have 1 values, got 2",
+        ),
+        (
+            MAPPING + STATES.replace("wheel.luff", "place.luff"),
+            "'place.luff', which is none of the states of crane",
+        ),
         (MAPPING + STATES.replace(', "wheel.luff"', ""), "truth.states must name 2 numbers"),
-        (MAPPING.replace("joints =", "truth.states = []\n#") + NOMINAL, "truth.states must name the states"),
+        (
+            MAPPING.replace("joints =", "truth.states = []\n#") + NOMINAL,
+            "truth.states must name the states",
+        ),
     ],
 )
 def test_a_mapping_whose_models_do_not_fit_is_one_clear_line(tmp_path, text, message):
@@ -206,7 +259,12 @@ def test_a_mapping_whose_models_do_not_fit_is_one_clear_line(tmp_path, text, mes
 
 
 def test_an_fmu_of_fmi_3_is_told_by_its_version():
-    with pytest.raises(ValueError, match=r"is of FMI 3.0, so its Jacobian cannot be read; wanted FMI 2 with model"):
+    with pytest.raises(
+        ValueError, match=r"is of FMI 3.0, so its Jacobian cannot be read; wanted FMI 2 with model"
+    ):
         ur5_model(3)
-    with pytest.raises(ValueError, match=r"joints names 'home\[1\]', which is none of the states of ur5.*: joint_pos"):
+    with pytest.raises(
+        ValueError,
+        match=r"joints names 'home\[1\]', which is none of the states of ur5.*: joint_pos",
+    ):
         ur5_model(2, joints=("home",))

@@ -57,7 +57,9 @@ def test_a_world_has_the_settings_of_a_bench_and_the_noise_that_they_ask_for(tmp
         last[noise] = (steps["feature_x_m"] - steps["true_feature_x_m"]).std()
     assert last[0.0] == 0.0
     assert 0.003 < last[0.01] < 0.03
-    with pytest.raises(ConfigurationError, match="plant Cell: the plant has no camera that could be moved; leave"):
+    with pytest.raises(
+        ConfigurationError, match="plant Cell: the plant has no camera that could be moved; leave"
+    ):
         servobench.run("constant", "./cell.py", mismatch="camera_move=30deg", settings=SHORT)
 
 
@@ -79,17 +81,27 @@ def test_a_class_is_taken_in_python_and_its_robot_may_be_its_own():
             super().__init__(replace(setup, period=0.02))
 
     target = {"target": [0.0, 0.0], "duration": 6.0}
-    how = {"mismatch": "none", "settings": {"target": target, "constant": {"initial": {"source": "probe"}}}}
+    how = {
+        "mismatch": "none",
+        "settings": {"target": target, "constant": {"initial": {"source": "probe"}}},
+    }
     run = servobench.run("constant", Plain, task="target", **how)
     assert run.row["outcome"] == "settled", run.row["reason"]
-    with pytest.raises(ConfigurationError, match=r"Fixed: spec\.period must be that of its setup, 0\.05 s"):
+    with pytest.raises(
+        ConfigurationError, match=r"Fixed: spec\.period must be that of its setup, 0\.05 s"
+    ):
         servobench.run("constant", Fixed, task="target", **how)
 
 
 def test_what_changed_since_a_batch_began_is_named():
     def manifest(text="1", arm="1"):
         plugin = {"place": "some.law:Mine", "distribution": "some 1.0", "sha256": text}
-        return {"own_controllers": {}, "own_plants": {}, "plugins": {"mine": plugin}, "files": {"arm.toml": arm}}
+        return {
+            "own_controllers": {},
+            "own_plants": {},
+            "plugins": {"mine": plugin},
+            "files": {"arm.toml": arm},
+        }
 
     there = json.loads(json.dumps(manifest()))
     assert changed_source(there, manifest()) == ""
@@ -102,12 +114,20 @@ def test_a_plant_and_a_controller_cannot_share_a_name(tmp_path):
     write(tmp_path, CELL, "cell.py")
     write(tmp_path, WHOLE)
     assert choose_plant("Same=./cell.py") == "Same"
-    with pytest.raises(ConfigurationError, match=r"\./cell\.py and \./mine\.py are both called 'Same'"):
+    with pytest.raises(
+        ConfigurationError, match=r"\./cell\.py and \./mine\.py are both called 'Same'"
+    ):
         choose_controller("Same=./mine.py")
-    for name, what in (("kinematic", "a plant"), ("ukf_mfac", "a controller"), ("run", "a section of settings")):
+    for name, what in (
+        ("kinematic", "a plant"),
+        ("ukf_mfac", "a controller"),
+        ("run", "a section of settings"),
+    ):
         with pytest.raises(ConfigurationError, match=f"{what} called '{name}' exists already"):
             choose_plant(f"{name}=./cell.py")
-    with pytest.raises(ConfigurationError, match="a task is called 'circle', too; give the plant another name"):
+    with pytest.raises(
+        ConfigurationError, match="a task is called 'circle', too; give the plant another name"
+    ):
         servobench.run("constant", "circle=./cell.py", task="circle")
 
 
@@ -142,7 +162,9 @@ def test_a_broken_file_is_one_line_with_its_place(tmp_path, what):
 
 @pytest.mark.slow
 def test_a_command_refuses_a_broken_engine_with_its_line_and_exit_code_2(refusal_of, tmp_path):
-    write(tmp_path, CONFIGURED_CELL + ENTRY.replace("Cell)", "Cell, engine=lambda: 1 / 0)"), "cell.py")
+    write(
+        tmp_path, CONFIGURED_CELL + ENTRY.replace("Cell)", "Cell, engine=lambda: 1 / 0)"), "cell.py"
+    )
     line = refusal_of("run", "--plant", "./cell.py", "constant")
     assert line.startswith("servobench: cell.py:42: ZeroDivisionError: division by zero")
     assert [path.name for path in tmp_path.iterdir()] == ["cell.py"]
@@ -152,8 +174,16 @@ SEEN, MOVED = "return self.model.feature(self.q)\n", "return self.q\n\n    def s
 FAILING = [
     (SEEN, "1 / 0", r"ZeroDivisionError: .*cell\.py:26 in Cell\.see"),
     (SEEN, "return 'here'\n", "Cell.see must return 3 features, or None, got 'here'"),
-    (MOVED, MOVED.replace("self.q", "self.q[:5]"), r"Cell\.advance must return 6 joint positions, got shape \(5,\)"),
-    (MOVED, MOVED.replace("self.q", "self.q * np.nan"), r"Cell\.advance returned \[nan, .* not finite"),
+    (
+        MOVED,
+        MOVED.replace("self.q", "self.q[:5]"),
+        r"Cell\.advance must return 6 joint positions, got shape \(5,\)",
+    ),
+    (
+        MOVED,
+        MOVED.replace("self.q", "self.q * np.nan"),
+        r"Cell\.advance returned \[nan, .* not finite",
+    ),
 ]
 
 
@@ -165,14 +195,30 @@ def test_what_fails_in_a_run_is_a_row_that_says_where(tmp_path, line, with_, rea
     assert re.search(reason, table["reason"].iloc[0]), table["reason"].iloc[0]
 
 
-def test_a_plant_is_named_on_every_command_that_takes_one(refusal_of, output_of, no_figures, tmp_path, monkeypatch):
+def test_a_plant_is_named_on_every_command_that_takes_one(
+    refusal_of, output_of, no_figures, tmp_path, monkeypatch
+):
     write(tmp_path, CONFIGURED_CELL, "cell.py")
     assert json.loads(output_of("plants", "./cell.py", "--json"))[0]["setting"] == "Cell.speed"
     assert "./cell.py: keeps its contract" in output_of("check", "plant", "./cell.py")
     assert command(monkeypatch, "init", "--plants", "./cell.py", "cell.toml") == 0
     assert "[Cell]" in (tmp_path / "cell.toml").read_text()
-    asked = ["--plants", "./cell.py", "--controllers", "constant", "--tasks", "exp1", "--no-report", "--workers", "1"]
-    assert "exp1 on Cell, moderate" in output_of("compare", *asked, "--config", "cell.toml", "--out", "out")
+    asked = [
+        "--plants",
+        "./cell.py",
+        "--controllers",
+        "constant",
+        "--tasks",
+        "exp1",
+        "--no-report",
+        "--workers",
+        "1",
+    ]
+    assert "exp1 on Cell, moderate" in output_of(
+        "compare", *asked, "--config", "cell.toml", "--out", "out"
+    )
     write(tmp_path, PLAIN_CELL, "own.py")
-    line = refusal_of("robustness", "--plant", "./own.py", "--controllers", "constant", "--out", "map")
+    line = refusal_of(
+        "robustness", "--plant", "./own.py", "--controllers", "constant", "--out", "map"
+    )
     assert "the map varies the true robot, and plant Plain brings one of its own" in line

@@ -54,10 +54,14 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("place", ["isolate=True", "executor=pool"])
-def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_refused_with_the_remedy(tmp_path, place):
+def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_refused_with_the_remedy(
+    tmp_path, place
+):
     (tmp_path / "script.py").write_text(BELOW_THE_GUARD.replace("isolate=True", place))
     remedy = "define it above `if __name__ == '__main__':`"
-    line = python("script.py", path=tmp_path, PYTHONPATH=os.pathsep.join(sys.path)).stderr.splitlines()[-1]
+    line = python(
+        "script.py", path=tmp_path, PYTHONPATH=os.pathsep.join(sys.path)
+    ).stderr.splitlines()[-1]
     assert "a worker process lacks a class: Can't get attribute 'Mine'" in line
     assert remedy in line
     for place in ("script.py", "script.py:Mine"):
@@ -67,9 +71,13 @@ def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_re
 
 @pytest.mark.parametrize("how", ["run_memory=2e9", "workers=2, out='out'"])
 def test_a_script_without_a_guard_gets_one_line_and_nothing_of_its_workers(tmp_path, how):
-    (tmp_path / "script.py").write_text(f"import servobench\nservobench.compare(['constant'], seeds=2, {how})\n")
+    (tmp_path / "script.py").write_text(
+        f"import servobench\nservobench.compare(['constant'], seeds=2, {how})\n"
+    )
     told = python("script.py", path=tmp_path).stderr
-    assert told.count("\n") == told.count("keep its calls below `if __name__ == '__main__':`") == 1, told
+    assert (
+        told.count("\n") == told.count("keep its calls below `if __name__ == '__main__':`") == 1
+    ), told
 
 
 def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
@@ -78,32 +86,61 @@ def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
         match="controller is of type int, wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
     ):
         servobench.run(3)
-    taken = servobench.ControllerEntry("ukf_mfac", "", NoSettings, lambda _config, knowledge: Resting(knowledge))
+    taken = servobench.ControllerEntry(
+        "ukf_mfac", "", NoSettings, lambda _config, knowledge: Resting(knowledge)
+    )
     with pytest.raises(ValueError, match="a controller called 'ukf_mfac' exists already"):
         servobench.compare([taken])
     with pytest.raises(ValueError, match="seeds must name at least one"):
         servobench.compare([Resting], seeds=())
 
 
-RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, controllers=["constant"])
+RUN, COMPARE = (
+    partial(servobench.run, "constant"),
+    partial(servobench.compare, controllers=["constant"]),
+)
 
 
 @pytest.mark.parametrize(
     ("call", "given", "words"),
     [
         (RUN, {"task": None}, "task must be a name, got None"),
-        (RUN, {"mismatch": 0.1}, "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1"),
+        (
+            RUN,
+            {"mismatch": 0.1},
+            "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1",
+        ),
         (RUN, {"robot": 3}, "robot must be a name, got 3"),
         (RUN, {"sensing": None}, "sensing must be a name, got None"),
         (RUN, {"seed": 1.5}, "seed must be a non-negative integer, got 1.5"),
         (RUN, {"seed": np.float64(1.5)}, "seed must be a non-negative integer, got 1.5"),
-        (RUN, {"settings": {"kinematic": {"lag": np.float64(-1.0)}}}, "kinematic.lag must be at least 0, got -1.0"),
+        (
+            RUN,
+            {"settings": {"kinematic": {"lag": np.float64(-1.0)}}},
+            "kinematic.lag must be at least 0, got -1.0",
+        ),
         (RUN, {"seed": True}, "seed must be a non-negative integer, got True"),
-        (RUN, {"seed": 10_500}, "seed 10500 cannot be used to judge: 10000:20000 are kept for tuning"),
-        (RUN, {"seed": 2**63}, "seeds must be at most 9223372036854775807, got 9223372036854775808"),
-        (RUN, {"settings": [1]}, "settings must be sections with keys, such as {'kinematic': {'lag': 0.1}}, got [1]"),
+        (
+            RUN,
+            {"seed": 10_500},
+            "seed 10500 cannot be used to judge: 10000:20000 are kept for tuning",
+        ),
+        (
+            RUN,
+            {"seed": 2**63},
+            "seeds must be at most 9223372036854775807, got 9223372036854775808",
+        ),
+        (
+            RUN,
+            {"settings": [1]},
+            "settings must be sections with keys, such as {'kinematic': {'lag': 0.1}}, got [1]",
+        ),
         (RUN, {"settings": {"kinematic": 3}}, "settings must be sections with keys"),
-        (COMPARE, {"controllers": "constant"}, "controllers must be a list, such as ['constant'], got 'constant'"),
+        (
+            COMPARE,
+            {"controllers": "constant"},
+            "controllers must be a list, such as ['constant'], got 'constant'",
+        ),
         (COMPARE, {"controllers": b"ab"}, "controllers must be a list, such as [b'ab'], got b'ab'"),
         (COMPARE, {"tasks": None}, "tasks must be a list"),
         (COMPARE, {"tasks": [[]]}, "task must be a name, got []"),
@@ -111,8 +148,16 @@ RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, 
         (COMPARE, {"seeds": [2**63]}, "seeds must be at most 9223372036854775807"),
         (COMPARE, {"seeds": 10**9}, "seeds must name at most 1,000,000, got 1000000000"),
         (COMPARE, {"seeds": 2**63}, "seeds must name at most 1,000,000, got 9223372036854775808"),
-        (COMPARE, {"seeds": count()}, "seeds must name at most 1,000,000, see the list that was given"),
-        (COMPARE, {"seeds": np.ones((1, 2), int)}, "seed must be a non-negative integer, got array([1, 1])"),
+        (
+            COMPARE,
+            {"seeds": count()},
+            "seeds must name at most 1,000,000, see the list that was given",
+        ),
+        (
+            COMPARE,
+            {"seeds": np.ones((1, 2), int)},
+            "seed must be a non-negative integer, got array([1, 1])",
+        ),
         (COMPARE, {"workers": 0}, "workers must be a number above 0, got 0"),
         (COMPARE, {"workers": np.float64(-1.0)}, "workers must be a number above 0, got -1.0"),
         (COMPARE, {"workers": 1.5}, "workers must be a whole number, got 1.5"),
@@ -120,12 +165,20 @@ RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, 
         (COMPARE, {"executor": 3}, "executor must be an executor of concurrent.futures, got 3"),
         (COMPARE, {"isolate": "no"}, "isolate must be True or False, got 'no'"),
         (COMPARE, {"out": 3}, "out must be the path of a folder, got 3"),
-        (COMPARE, {"run_timeout": 10**400}, "run_timeout must be below 1e300, or inf for no limit, got 1000"),
+        (
+            COMPARE,
+            {"run_timeout": 10**400},
+            "run_timeout must be below 1e300, or inf for no limit, got 1000",
+        ),
         (COMPARE, {"run_timeout": -1}, "run_timeout must be a number above 0, got -1"),
         (COMPARE, {"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
         (COMPARE, {"resume": True}, "resume needs out, the folder to continue in"),
         (servobench.load, {"folder": 3}, "folder must be the path of a folder, got 3"),
-        (COMPARE, {"executor": Executor(), "run_memory": 1e9}, "limits of time and memory are for processes of"),
+        (
+            COMPARE,
+            {"executor": Executor(), "run_memory": 1e9},
+            "limits of time and memory are for processes of",
+        ),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_refused_in_a_line(call, given, words):
@@ -138,9 +191,12 @@ def test_a_seed_of_numpy_is_that_seed():
     short = {"tasks": ["exp2"], "settings": {"exp2": {"duration": 0.5}}, "workers": np.int64(1)}
     assert servobench.compare(["constant"], seeds=seeds, **short)["seed"].tolist() == [3]
     of_numpy, own = (
-        servobench.run("constant", task="exp2", seed=each, settings={"exp2": {"duration": 0.5}}) for each in (seed, 3)
+        servobench.run("constant", task="exp2", seed=each, settings={"exp2": {"duration": 0.5}})
+        for each in (seed, 3)
     )
-    pd.testing.assert_frame_equal(judged(pd.DataFrame([of_numpy.row])), judged(pd.DataFrame([own.row])))
+    pd.testing.assert_frame_equal(
+        judged(pd.DataFrame([of_numpy.row])), judged(pd.DataFrame([own.row]))
+    )
 
 
 def test_every_public_name_has_a_docstring_and_no_other_name_is_there():
@@ -151,7 +207,9 @@ def test_every_public_name_has_a_docstring_and_no_other_name_is_there():
 
 
 @pytest.mark.slow
-def test_importing_the_package_imports_nothing_heavy_and_folders_of_the_same_names_do_no_harm(tmp_path):
+def test_importing_the_package_imports_nothing_heavy_and_folders_of_the_same_names_do_no_harm(
+    tmp_path,
+):
     for name in ("plant", "controllers", "harness", "fmus"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('a foreign package')")

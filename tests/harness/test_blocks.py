@@ -7,7 +7,13 @@ import math
 import pickle
 import time
 import zlib
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context
@@ -19,7 +25,14 @@ import pytest
 from kit.command import judged
 from kit.nightly import some
 from servobench.harness.batch import blocks, results, sandbox
-from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size, open_workers
+from servobench.harness.batch.blocks import (
+    Block,
+    Job,
+    carry_out_blocks,
+    cut,
+    even_size,
+    open_workers,
+)
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.processes import Bounds
@@ -72,13 +85,20 @@ def processes():
 def test_any_executor_gives_the_rows_of_this_process(alone, tmp_path, make):
     with make() as executor:
         carry_out(CAMPAIGN, tmp_path / "out", Execution(2, executor, block=7))
-    pd.testing.assert_frame_equal(judged(results.load_runs(tmp_path / "out")), alone, check_exact=True)
+    pd.testing.assert_frame_equal(
+        judged(results.load_runs(tmp_path / "out")), alone, check_exact=True
+    )
 
 
 def test_an_executor_of_threads_or_with_limits_of_runs_is_refused(tmp_path):
-    with ThreadPoolExecutor(1) as threads, pytest.raises(ConfigurationError, match="an executor must have processes"):
+    with (
+        ThreadPoolExecutor(1) as threads,
+        pytest.raises(ConfigurationError, match="an executor must have processes"),
+    ):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, threads))
-    with pytest.raises(ConfigurationError, match="limits of time and memory are for processes of this machine"):
+    with pytest.raises(
+        ConfigurationError, match="limits of time and memory are for processes of this machine"
+    ):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, Here(), Bounds(5.0)))
 
 
@@ -95,7 +115,8 @@ class Ended(Executor):
 
 
 @pytest.mark.parametrize(
-    ("error", "why"), [(BrokenProcessPool("a process died."), "a process died"), (CancelledError(), "no scheduler")]
+    ("error", "why"),
+    [(BrokenProcessPool("a process died."), "a process died"), (CancelledError(), "no scheduler")],
 )
 def test_an_executor_whose_workers_end_is_one_line_that_says_how_to_go_on(tmp_path, error, why):
     line = f"^the workers ended: {why}.*; finished runs are kept, and the same call with out and resume=True carries"
@@ -129,12 +150,16 @@ def _say_twice(_argument, tell):
 def test_threads_of_a_worker_of_an_executor_take_turns():
     task = Task(_say_twice, pickle.dumps(None))
     with ThreadPoolExecutor(3) as threads:
-        spans = sorted(json.loads(zlib.decompress(each)) for each in threads.map(blocks._gather, [task] * 3))
+        spans = sorted(
+            json.loads(zlib.decompress(each)) for each in threads.map(blocks._gather, [task] * 3)
+        )
     assert all(end <= begin for (_, end), (begin, _) in itertools.pairwise(spans))
 
 
 @pytest.mark.parametrize(("block", "workers"), [(7, 1), (1000, 1), (1000, 2)])
-def test_rows_do_not_depend_on_the_blocks_and_those_of_a_block_have_no_times(alone, tmp_path, block, workers):
+def test_rows_do_not_depend_on_the_blocks_and_those_of_a_block_have_no_times(
+    alone, tmp_path, block, workers
+):
     carry_out(CAMPAIGN, tmp_path / "out", Execution(workers, block=block))
     runs = results.load_runs(tmp_path / "out")
     pd.testing.assert_frame_equal(judged(runs), alone, check_exact=True)
@@ -156,7 +181,9 @@ def test_runs_that_are_missing_may_form_other_blocks(alone, tmp_path):
     pd.testing.assert_frame_equal(judged(results.load_runs(folder)), alone, check_exact=True)
 
 
-def test_where_runs_cannot_advance_together_each_is_carried_out_by_itself(alone, tmp_path, monkeypatch):
+def test_where_runs_cannot_advance_together_each_is_carried_out_by_itself(
+    alone, tmp_path, monkeypatch
+):
     def leave(_runs, *, keep):
         raise SystemExit(keep)
 
@@ -213,10 +240,15 @@ def dying_workers(how: Exception | End, sizes: list[int], *, guard: bool = False
     [
         (ProcessDied(), ("crashed", "the run killed the process that carried it out")),
         (End(Ending("timed_out", "it took long"), certain=True), ("timed_out", "it took long")),
-        (End(Ending("out_of_memory", "it held much"), certain=False), ("out_of_memory", "it held much")),
+        (
+            End(Ending("out_of_memory", "it held much"), certain=False),
+            ("out_of_memory", "it held much"),
+        ),
     ],
 )
-def test_a_block_that_is_lost_costs_only_the_run_that_did_it(alone, tmp_path, monkeypatch, how, end):
+def test_a_block_that_is_lost_costs_only_the_run_that_did_it(
+    alone, tmp_path, monkeypatch, how, end
+):
     sizes: list[int] = []
     workers = contextlib.nullcontext(dying_workers(how, sizes))
     monkeypatch.setattr("servobench.harness.batch.campaign.open_workers", lambda *_, **__: workers)
@@ -230,12 +262,16 @@ def test_a_block_that_is_lost_costs_only_the_run_that_did_it(alone, tmp_path, mo
     assert times(runs)[~lost].notna().all(axis=None)
 
 
-@pytest.mark.parametrize(("certain", "guard", "again"), [(True, False, 0), (False, False, 8), (False, True, 8)])
+@pytest.mark.parametrize(
+    ("certain", "guard", "again"), [(True, False, 0), (False, False, 8), (False, True, 8)]
+)
 def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_again(
     alone, tmp_path, monkeypatch, certain, guard, again
 ):
     sizes: list[int] = []
-    workers = contextlib.nullcontext(dying_workers(End(Ending("crashed", "it died"), certain), sizes, guard=guard))
+    workers = contextlib.nullcontext(
+        dying_workers(End(Ending("crashed", "it died"), certain), sizes, guard=guard)
+    )
     monkeypatch.setattr("servobench.harness.batch.campaign.open_workers", lambda *_, **__: workers)
     carry_out(CAMPAIGN, tmp_path / "out", Execution(2, block=1))
     runs = results.load_runs(tmp_path / "out")
@@ -247,19 +283,26 @@ def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_a
 
 
 @pytest.mark.parametrize("answers", [0, 1, 3])
-def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer_are_carried_out_again(answers):
+def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer_are_carried_out_again(
+    answers,
+):
     sizes: list[int] = []
 
     def submit(task):
         block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
-        told = [blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision"))) for each in block.jobs]
+        told = [
+            blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision")))
+            for each in block.jobs
+        ]
         sizes.append(len(block.jobs))
         future = Future()
         end = End(Ending("crashed", "SIGTERM"), certain=False) if len(sizes) == 1 else None
         future.set_result(Answer(told[:answers] if end else told, end))
         return future
 
-    outcomes = list(carry_out_blocks([Block(tuple(job(index, None) for index in range(3)))], Workers(submit)))
+    outcomes = list(
+        carry_out_blocks([Block(tuple(job(index, None) for index in range(3)))], Workers(submit))
+    )
     assert sorted(result.row["seed"] for _, found in outcomes for result in found) == [0, 1, 2]
     assert all(result.row["status"] == "collision" for _, found in outcomes for result in found)
     assert sizes == [size for size in (3, answers < 3, 2 - answers) if size > 0]
@@ -281,7 +324,10 @@ def test_runs_that_wait_at_a_worker_of_dask_that_dies_are_not_blamed(kind):
         if died:
             raise ProcessDied
         return Answer(
-            [blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision"))) for each in block.jobs]
+            [
+                blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision")))
+                for each in block.jobs
+            ]
         )
 
     def submit(task):
@@ -290,7 +336,9 @@ def test_runs_that_wait_at_a_worker_of_dask_that_dies_are_not_blamed(kind):
 
     with ThreadPoolExecutor(1) as thread:
         made = cut([job(index, kind) for index in range(24)], size=12)
-        outcomes = list(carry_out_blocks(made, Workers(submit, 1, cluster=True, lost=(ProcessDied,))))
+        outcomes = list(
+            carry_out_blocks(made, Workers(submit, 1, cluster=True, lost=(ProcessDied,)))
+        )
     ends = {result.row["seed"]: result.row["status"] for _, found in outcomes for result in found}
     assert ends == {index: "crashed" if index in {3, 13} else "collision" for index in range(24)}
 
@@ -298,7 +346,10 @@ def test_runs_that_wait_at_a_worker_of_dask_that_dies_are_not_blamed(kind):
 def test_a_block_has_consecutive_runs_of_one_kind():
     kinds = "aaaaabbxxxxxaa"
     jobs = [job(i, None if kind == "x" else kind) for i, kind in enumerate(kinds) if i != 4]
-    made = [([each.index for each in block.jobs], block.together) for block in cut(jobs, size=3, chunk=2)]
+    made = [
+        ([each.index for each in block.jobs], block.together)
+        for block in cut(jobs, size=3, chunk=2)
+    ]
     assert made == [
         ([0, 1, 2], True), ([3], True), ([5, 6], True), ([7, 8], False), ([9, 10], False), ([11], False),
         ([12, 13], True),
@@ -306,7 +357,8 @@ def test_a_block_has_consecutive_runs_of_one_kind():
 
 
 @pytest.mark.parametrize(
-    ("count", "workers", "size"), [(200, 2, 100), (300, 2, 75), (1000, 1, 125), (5, 8, 1), (100_000, 2, 128), (0, 2, 0)]
+    ("count", "workers", "size"),
+    [(200, 2, 100), (300, 2, 75), (1000, 1, 125), (5, 8, 1), (100_000, 2, 128), (0, 2, 0)],
 )
 def test_all_workers_get_the_same_share(count, workers, size):
     assert even_size(count, workers, 128) == size
@@ -340,24 +392,39 @@ def test_cells_of_a_plan_are_made_one_by_one():
     assert grid[10**6 + 3] == (0, "b", 3)
     assert grid[-1] == (10**6 - 1, "b", 10**6 - 1)
     assert len(made) == 2
-    assert list(Grid(lambda *values: values, "ab", range(2))) == [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
+    assert list(Grid(lambda *values: values, "ab", range(2))) == [
+        ("a", 0),
+        ("a", 1),
+        ("b", 0),
+        ("b", 1),
+    ]
     with pytest.raises(IndexError):
         grid[len(grid)]
 
 
 def test_a_survey_finds_what_the_runs_are_without_keeping_them():
-    batch = Batch(("kinematic", "fmu"), ("constant", "rls"), ("random",), ("none", "moderate"), (3, 4, 9, 5))
+    batch = Batch(
+        ("kinematic", "fmu"), ("constant", "rls"), ("random",), ("none", "moderate"), (3, 4, 9, 5)
+    )
     found = survey(batch.requests())
     assert (found.count, found.seeds) == (32, [range(3, 6), range(9, 10)])
     assert [list(each) for each in (found.plants, found.controllers, found.mismatches)] == [
         ["kinematic", "fmu"], ["constant", "rls"], ["none", "moderate"],
     ]  # fmt: skip
     assert len(found.examples) == 6
-    assert found.digest == survey(list(batch.requests())).digest != survey(batch.requests()[::-1]).digest
-    with pytest.raises(ConfigurationError, match="the run kinematic-constant-random-none-3 is asked for twice"):
+    assert (
+        found.digest
+        == survey(list(batch.requests())).digest
+        != survey(batch.requests()[::-1]).digest
+    )
+    with pytest.raises(
+        ConfigurationError, match="the run kinematic-constant-random-none-3 is asked for twice"
+    ):
         survey([*batch.requests(), batch.requests()[0]])
     upper = [RunRequest("kinematic", name, "random", "none", 3) for name in ("mine", "Mine")]
-    with pytest.raises(ConfigurationError, match="the run kinematic-mine-random-none-3 is asked for twice"):
+    with pytest.raises(
+        ConfigurationError, match="the run kinematic-mine-random-none-3 is asked for twice"
+    ):
         survey(upper)
 
 
@@ -404,9 +471,13 @@ def real() -> RunResult:
     return run_experiment(job(0, None).run.request, Settings({"random": {"duration": 2.0}}))
 
 
-def sent(result: RunResult, row: dict[str, object] | None = None, steps: pd.DataFrame | None = None) -> RunResult:
+def sent(
+    result: RunResult, row: dict[str, object] | None = None, steps: pd.DataFrame | None = None
+) -> RunResult:
     """Return a result as it comes back from a process that changed some of it."""
-    changed = replace(result, row=result.row | (row or {}), steps=result.steps if steps is None else steps)
+    changed = replace(
+        result, row=result.row | (row or {}), steps=result.steps if steps is None else steps
+    )
     return blocks.unpack_result(job(0, None), json.loads(json.dumps(blocks.pack_result(changed))))
 
 
@@ -416,7 +487,9 @@ def test_a_result_is_the_same_after_its_way_through_a_process(real):
     pd.testing.assert_frame_equal(back.steps, real.steps, check_exact=True)
     np.testing.assert_array_equal(back.picture, picture)
     assert list(back.row) == list(real.row)
-    pd.testing.assert_frame_equal(pd.DataFrame([back.row]), pd.DataFrame([real.row]), check_exact=True)
+    pd.testing.assert_frame_equal(
+        pd.DataFrame([back.row]), pd.DataFrame([real.row]), check_exact=True
+    )
     assert back.trace == "trace"
     assert sent(replace(real, steps=None)).steps is None
 
@@ -424,17 +497,29 @@ def test_a_result_is_the_same_after_its_way_through_a_process(real):
 @pytest.mark.parametrize(
     ("row", "why"),
     [
-        ({"outcome": "followed"}, "its outcome 'followed' contradicts its status, settling time or error"),
+        (
+            {"outcome": "followed"},
+            "its outcome 'followed' contradicts its status, settling time or error",
+        ),
         ({"outcome": "settled", "settling_time_s": math.nan}, "its outcome 'settled' contradicts"),
-        ({"outcome": "not_settled", "settling_time_s": 0.1}, "its outcome 'not_settled' contradicts"),
+        (
+            {"outcome": "not_settled", "settling_time_s": 0.1},
+            "its outcome 'not_settled' contradicts",
+        ),
         ({"outcome": "brilliant"}, "its outcome 'brilliant' contradicts"),
         ({"outcome": "settled", "settling_time_s": 9.0}, "its settling time 9 s is beyond its 2 s"),
-        ({"outcome": "settled", "settling_time_s": 0.0}, "its steady_state_error is outside the band"),
+        (
+            {"outcome": "settled", "settling_time_s": 0.0},
+            "its steady_state_error is outside the band",
+        ),
         ({"status": "collision"}, "its outcome '[a-z_]+' contradicts its status"),
         ({"rms_error": 1e3}, "its rms_error is larger than its largest error"),
         ({"rms_error": 0.0}, "its rms_error is 0, and by its steps"),
         ({"control_effort_rad": 0.0}, "its control_effort_rad is 0, and by its steps"),
-        ({"controller_time_median_us": 1.0}, "its controller_time_median_us is 1, and by its steps"),
+        (
+            {"controller_time_median_us": 1.0},
+            "its controller_time_median_us is 1, and by its steps",
+        ),
         ({"periods": 3}, "it has 3 periods and "),
     ],
 )
@@ -469,9 +554,15 @@ def test_a_task_that_is_done_with_fewer_answers_than_runs_has_a_row_for_each_run
         return future
 
     jobs = tuple(job(index, None) for index in range(3))
-    found = [result for _, part in carry_out_blocks([Block(jobs)], Workers(submit)) for result in part]
+    found = [
+        result for _, part in carry_out_blocks([Block(jobs)], Workers(submit)) for result in part
+    ]
     ends = {result.row["seed"]: result.row["status"] for result in found}
-    assert ends == {0: "collision" if count and not unreadable else "crashed", 1: "crashed", 2: "crashed"}
+    assert ends == {
+        0: "collision" if count and not unreadable else "crashed",
+        1: "crashed",
+        2: "crashed",
+    }
     reasons = {result.row["reason"] for result in found if result.row["status"] == "crashed"}
     assert (sandbox.SILENT in reasons) == (not unreadable)
 
@@ -483,5 +574,9 @@ def test_more_answers_than_runs_are_no_answer():
         future.set_result(Answer([told(), told()] if block.jobs[0].index == 0 else [told()]))
         return future
 
-    (found,) = [result for _, part in carry_out_blocks([Block((job(0, None),))], Workers(submit)) for result in part]
+    (found,) = [
+        result
+        for _, part in carry_out_blocks([Block((job(0, None),))], Workers(submit))
+        for result in part
+    ]
     assert (found.row["status"], found.row["reason"]) == ("crashed", sandbox.TALKATIVE)

@@ -36,25 +36,33 @@ WORD = "ur10e with mine.toml"
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(CAMERA + ON_FLANGE)
-    aside = CAMERA.replace("615.0", "500.0") + '[pose]\nframe = "base"\nposition = [0.0, 0.5, 1.55]\n'
-    Path("aside.toml").write_text(aside + "rotation = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]\n")
+    aside = (
+        CAMERA.replace("615.0", "500.0") + '[pose]\nframe = "base"\nposition = [0.0, 0.5, 1.55]\n'
+    )
+    Path("aside.toml").write_text(
+        aside + "rotation = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]\n"
+    )
     Path("planned.toml").write_text(CAMERA.replace('noise = "0.5px"', ""))
 
 
 def request(task="random", seed=1, sensing="pixel:hand", plant="kinematic", robot=WORD):
-    return RunRequest(plant, "regression_mfac", task, "moderate", seed, robot=robot, sensing=sensing)
+    return RunRequest(
+        plant, "regression_mfac", task, "moderate", seed, robot=robot, sensing=sensing
+    )
 
 
 def test_features_are_in_its_image_and_change_at_its_rate():
     result = run_experiment(request(), Settings({"random": {"duration": 3.0}}))
-    assert result.row["run_id"] == "kinematic-ur10e+mine.toml-pixel_hand-regression_mfac-random-moderate-1"
+    assert (
+        result.row["run_id"]
+        == "kinematic-ur10e+mine.toml-pixel_hand-regression_mfac-random-moderate-1"
+    )
     assert result.steps is not None
     u, v = (result.steps[f"feature_{name}_px"] for name in ("u", "v"))
     assert u.between(0, 640).all()
     assert v.between(0, 480).all()
-    assert (
-        max(u.max() - 320, 320 - u.min()) > 160 or max(v.max() - 240, 240 - v.min()) > 120
-    )  # beyond the bench's image
+    # Beyond the bench's image
+    assert max(u.max() - 320, 320 - u.min()) > 160 or max(v.max() - 240, 240 - v.min()) > 120
     frames = (15.0 * result.steps["time_s"] + 1e-9).astype(int).diff().iloc[1:].to_numpy() > 0
     np.testing.assert_array_equal(u.diff().iloc[1:].to_numpy() != 0.0, frames)
 
@@ -82,7 +90,9 @@ def test_a_circle_is_within_the_image_and_leads_through_where_the_target_is(sens
     points = drawn.scenario.reference.points(np.linspace(0.0, 10.0, 50))
     assert drawn.true.valid_at(points, 1.0).all()
     middle = 0.5 * (points[0] + points[25])
-    assert np.linalg.norm(middle - drawn.true.points(drawn.scenario.start)) < 0.2 * drawn.true.distance
+    assert (
+        np.linalg.norm(middle - drawn.true.points(drawn.scenario.start)) < 0.2 * drawn.true.distance
+    )
 
 
 def test_a_folder_tells_its_camera():
@@ -94,7 +104,9 @@ def test_a_folder_tells_its_camera():
 
 
 def test_a_run_is_shown_through_its_camera():
-    result = run_experiment(request(sensing="position", robot="ur10e with planned.toml"), Settings())
+    result = run_experiment(
+        request(sensing="position", robot="ur10e with planned.toml"), Settings()
+    )
     shown = logged_run(result.row, result.steps)
     assert shown.robot.pinhole.width == 640
     np.testing.assert_allclose(shown.ball[-1], shown.reference[-1], atol=0.01)
@@ -119,17 +131,32 @@ def test_a_challenge_has_the_camera_of_a_file_beside_it(tmp_path):
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_one_line(refusal_of, command, said):
-    arguments = ["run", "constant", "--plant", "kinematic", "--camera", "mine.toml", *command, "--out", "out"]
+    arguments = [
+        "run",
+        "constant",
+        "--plant",
+        "kinematic",
+        "--camera",
+        "mine.toml",
+        *command,
+        "--out",
+        "out",
+    ]
     assert said in " ".join(refusal_of(*arguments).split())
 
 
 def test_a_distance_that_no_two_targets_in_view_have_is_one_line(monkeypatch):
     monkeypatch.setattr(starts, "MAX_DRAWS", 512)
-    with pytest.raises(ConfigurationError, match=r"of 512 postures .* no two of these are shortest = 100 m apart"):
+    with pytest.raises(
+        ConfigurationError, match=r"of 512 postures .* no two of these are shortest = 100 m apart"
+    ):
         run_experiment(request(), Settings({"random": {"shortest": 100.0}}))
 
 
 def test_a_plant_with_a_camera_of_its_own_refuses_it():
     cell = replace(KINEMATIC, name="cell", any_sensing=False)
-    with pytest.raises(ConfigurationError, match="plant cell brings a camera of its own, so --camera mine.toml does"):
+    with pytest.raises(
+        ConfigurationError,
+        match="plant cell brings a camera of its own, so --camera mine.toml does",
+    ):
         package.run("constant", cell, task="random", robot="ur5 with mine.toml")

@@ -39,7 +39,11 @@ def assert_same(found, wanted):
 def test_a_file_of_everything_reads_back_to_the_same_settings(tmp_path):
     names = PLANTS, (*controller_names(), "mfac+rls"), tuple(TASKS)
     wanted = sections(*names)
-    path = write(tmp_path, configuration_file(wanted, wanted, dict.fromkeys(wanted, "about"), "run"), "all.toml")
+    path = write(
+        tmp_path,
+        configuration_file(wanted, wanted, dict.fromkeys(wanted, "about"), "run"),
+        "all.toml",
+    )
     assert_same(sections(*names, path=path), wanted)
     read = tomllib.loads(path.read_text(encoding="utf-8"))
     for name, config in wanted.items():
@@ -69,9 +73,13 @@ def test_changed_settings_are_kept_and_their_defaults_told(output_of, tmp_path):
 def test_a_file_of_settings_serves_commands_that_read_a_part_of_it(output_of, tmp_path):
     path = tmp_path / "bench.toml"
     output_of("init", path, "--plants", "all", "--controllers", "constant,mfac+rls")
-    again = output_of("init", "-", "--plants", "kinematic", "--controllers", "constant", "--config", path)
+    again = output_of(
+        "init", "-", "--plants", "kinematic", "--controllers", "constant", "--config", path
+    )
     assert list(tomllib.loads(again)) == ["run", "kinematic", "constant", "exp2"]
-    output_of("fmu", "export", "--controller", "constant", "-o", tmp_path / "loop.fmu", "--config", path)
+    output_of(
+        "fmu", "export", "--controller", "constant", "-o", tmp_path / "loop.fmu", "--config", path
+    )
     assert (tmp_path / "loop.fmu").exists()
 
 
@@ -86,7 +94,9 @@ def test_settings_of_a_plant_that_cannot_run_here_can_be_written(monkeypatch):
     missing = replace(registry.find_plant("bullet"), needs=("a_package_that_is_not_there",))
     monkeypatch.setattr(registry, "find_plant", lambda _: missing)
     assert "bullet" in sections(("bullet",), ("constant",), ("exp2",))
-    with pytest.raises(ConfigurationError, match="plant 'bullet' needs a_package_that_is_not_there"):
+    with pytest.raises(
+        ConfigurationError, match="plant 'bullet' needs a_package_that_is_not_there"
+    ):
         resolve_sections([RunRequest("bullet", "constant", "exp2", "none", 0)], Settings())
 
 
@@ -96,7 +106,9 @@ CONFIGS = {name: entry.config() for name, entry in (*ESTIMATORS.items(), *LAWS.i
 CONFIGS |= {name: registry.find_plant(name).config() for name in PLANTS}
 CONFIGS |= {name: entry.default for name, entry in TASKS.items()}
 CONFIGS |= {"aids": AidsConfig(), "initial": InitialConfig(), "run": RunSettings()}
-CONFIGS |= {name: registry.find_controller(name).config() for name in ("rbfnn_mfac", "nmpc_calibrated")}
+CONFIGS |= {
+    name: registry.find_controller(name).config() for name in ("rbfnn_mfac", "nmpc_calibrated")
+}
 
 
 def ruled_out(setting):
@@ -116,10 +128,16 @@ def test_no_setting_takes_a_value_that_its_words_rule_out(name):
             values = value
             for part in reversed(setting.key.split(".")):
                 values = {part: values}
-            with pytest.raises(ConfigurationError, match=rf"{name}\.{setting.key}(\.\d+)* must be [^\n]*$"):
+            with pytest.raises(
+                ConfigurationError, match=rf"{name}\.{setting.key}(\.\d+)* must be [^\n]*$"
+            ):
                 Settings({name: values}).resolve(name, CONFIGS[name])
 
 
 def test_most_settings_have_a_bound():
     settings = [setting for config in CONFIGS.values() for setting in describe_settings(config)]
-    assert sum(any(True for _ in ruled_out(setting)) for setting in settings) > 0.7 * len(settings) > 250
+    assert (
+        sum(any(True for _ in ruled_out(setting)) for setting in settings)
+        > 0.7 * len(settings)
+        > 250
+    )

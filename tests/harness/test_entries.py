@@ -31,7 +31,11 @@ pytestmark = pytest.mark.usefixtures("own_folder")
         (CONFIGURED + ENTRY, "./mine.py", "mine"),
         (CONFIGURED + ENTRY, "./mine.py:ENTRY", "mine"),
         (CONFIGURED + ENTRY, "./mine.py:Mine", "Mine"),
-        ("from abc import ABC\n" + TWO.replace("Controller)", "Controller, ABC)"), "./mine.py:Mine", "Mine"),
+        (
+            "from abc import ABC\n" + TWO.replace("Controller)", "Controller, ABC)"),
+            "./mine.py:Mine",
+            "Mine",
+        ),
     ],
 )
 def test_a_controller_is_found_by_the_place_of_its_code(tmp_path, text, place, name):
@@ -71,10 +75,15 @@ def test_two_controllers_of_one_name_are_refused_and_can_be_renamed(tmp_path):
     write(tmp_path, WHOLE, "b.py")
     write(tmp_path, CONFIGURED + ENTRY.replace('"mine"', '"ukf_mfac"'), "c.py")
     assert choose_controller("./a.py") == "Mine"
-    with pytest.raises(ConfigurationError, match=r"\./a\.py and \./b\.py are both called 'Mine'; .* my_Mine=\./b\.py"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"\./a\.py and \./b\.py are both called 'Mine'; .* my_Mine=\./b\.py",
+    ):
         choose_controller("./b.py")
     assert choose_controller("my_Mine=./b.py") == "my_Mine"
-    with pytest.raises(ConfigurationError, match=r"called 'ukf_mfac' exists already; .* my_ukf_mfac=\./c\.py"):
+    with pytest.raises(
+        ConfigurationError, match=r"called 'ukf_mfac' exists already; .* my_ukf_mfac=\./c\.py"
+    ):
         choose_controller("./c.py")
 
 
@@ -179,11 +188,15 @@ def test_a_broken_file_is_one_line_with_its_place(tmp_path, what):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["syntax", "exception in the constructor", "an entry that builds something else"])
+@pytest.mark.parametrize(
+    "what", ["syntax", "exception in the constructor", "an entry that builds something else"]
+)
 def test_a_command_refuses_a_broken_file_with_this_line_and_exit_code_2(refusal_of, tmp_path, what):
     text, message = BROKEN[what]
     write(tmp_path, text)
-    assert refusal_of("run", "--plant", "kinematic", "--controller", "./mine.py").startswith(f"servobench: {message}")
+    assert refusal_of("run", "--plant", "kinematic", "--controller", "./mine.py").startswith(
+        f"servobench: {message}"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
 
 
@@ -192,12 +205,21 @@ def test_a_command_refuses_a_broken_file_with_this_line_and_exit_code_2(refusal_
     [
         ("./mien.py", r"there is no file \./mien\.py: did you mean 'mine\.py'\?"),
         ("nowhere/mine.py", r"there is no file nowhere/mine\.py: nowhere holds no Python file"),
-        ("my-own=./mine.py", r"there is no file my-own=\./mine\.py: a name before = has letters, digits and _ only"),
+        (
+            "my-own=./mine.py",
+            r"there is no file my-own=\./mine\.py: a name before = has letters, digits and _ only",
+        ),
         ("./a=b/mine.py", r"there is no file \./a=b/mine\.py: a=b holds no Python file"),
         ("./mine.py:Mien", r"\./mine\.py has no 'Mien': did you mean 'Mine'"),
-        ("./mine.py:np", r"\./mine\.py:np is of type module, wanted a subclass of servobench\.Controller"),
+        (
+            "./mine.py:np",
+            r"\./mine\.py:np is of type module, wanted a subclass of servobench\.Controller",
+        ),
         ("mine", r"unknown controller 'mine': did you mean your file '\./mine\.py'\?"),
-        ("ukf_mfca:published", "unknown controller 'ukf_mfca:published': did you mean 'ukf_mfac:published'"),
+        (
+            "ukf_mfca:published",
+            "unknown controller 'ukf_mfca:published': did you mean 'ukf_mfac:published'",
+        ),
         ("kit.own:Mine", "kit.own has no 'Mine': it defines no controller"),
         ("kit.nothing:Mine", "ModuleNotFoundError: No module named 'kit.nothing'"),
     ],
@@ -212,7 +234,9 @@ def test_a_present_folder_that_was_deleted_is_named(tmp_path, monkeypatch):
     (folder := tmp_path / "gone").mkdir()
     monkeypatch.chdir(folder)
     folder.rmdir()
-    with pytest.raises(ConfigurationError, match="the present folder was deleted; change to one that exists"):
+    with pytest.raises(
+        ConfigurationError, match="the present folder was deleted; change to one that exists"
+    ):
         choose_controller("./mine.py")
 
 
@@ -224,7 +248,9 @@ def test_two_files_beside_two_controllers_that_have_one_name_are_refused(tmp_pat
     write(tmp_path, "import own_helper_of_a_user\n" + WHOLE, "b/direct.py")
     assert choose_controller("first=a/mine.py") == "first"
     taken = "import own_helper_of_a_user would take a/own_helper_of_a_user.py instead of b/own_helper_of_a_user.py"
-    with pytest.raises(ConfigurationError, match=f"^b/direct.py:1: {taken}, as a process has one module of a name"):
+    with pytest.raises(
+        ConfigurationError, match=f"^b/direct.py:1: {taken}, as a process has one module of a name"
+    ):
         choose_controller("b/direct.py")
     assert choose_controller("again=a/mine.py") == "again"
 
@@ -233,7 +259,9 @@ def test_two_files_beside_two_controllers_that_have_one_name_are_refused(tmp_pat
 def test_a_file_that_an_installed_module_would_hide_is_refused(tmp_path, name):
     write(tmp_path, "GAIN = 3.0\n", f"{name}.py")
     write(tmp_path, f"import {name}\n" + WHOLE)
-    with pytest.raises(ConfigurationError, match=rf"^mine\.py:1: import {name} would take .* instead of {name}\.py"):
+    with pytest.raises(
+        ConfigurationError, match=rf"^mine\.py:1: import {name} would take .* instead of {name}\.py"
+    ):
         choose_controller("./mine.py")
     write(tmp_path, WHOLE, "other.py")  # which does not import it
     assert choose_controller("./other.py") == "Mine"
@@ -261,7 +289,9 @@ COMMANDS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "why"), HARMFUL.items())
-def test_an_import_that_ends_or_hangs_its_process_is_one_line(tmp_path, monkeypatch, capfd, line, why):
+def test_an_import_that_ends_or_hangs_its_process_is_one_line(
+    tmp_path, monkeypatch, capfd, line, why
+):
     monkeypatch.setattr(trials, "IMPORT_LIMIT", 2.0)
     write(tmp_path, f"import ctypes, os, signal, time\nprint('a banner')\n\n{line}\n{WHOLE}")
     assert command(monkeypatch, *COMMANDS["run"]) == 2

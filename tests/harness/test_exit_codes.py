@@ -83,7 +83,9 @@ def test_a_run_that_failed_is_told_with_its_place_and_the_log(call, capsys):
     call(*RUN, "crashing")
     lines = capsys.readouterr().out.splitlines()
     reason = next(line for line in lines if line.startswith("kinematic-crashing-exp2-moderate-0: "))
-    assert reason.startswith("kinematic-crashing-exp2-moderate-0: crashed: KeyError: 'gain' (test_exit_codes.py:")
+    assert reason.startswith(
+        "kinematic-crashing-exp2-moderate-0: crashed: KeyError: 'gain' (test_exit_codes.py:"
+    )
     assert reason.endswith(" in Ending.step)")
     assert lines[-1] == f"1 of 1 run failed; why: out/{results.FAILURES}"
 
@@ -116,7 +118,9 @@ def test_a_temporary_folder_without_room_is_one_line(call, monkeypatch, capsys, 
         assert call("fmu", "export", "--output", str(tmp_path / "arm.fmu")) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert error.startswith("servobench: no temporary folder takes a file; free room in one, or name another: TMPDIR=")
+    assert error.startswith(
+        "servobench: no temporary folder takes a file; free room in one, or name another: TMPDIR="
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -124,20 +128,24 @@ def test_a_segmentation_fault_says_in_which_line(tmp_path):
     plugin = "import ctypes\n\ndef strike():\n    ctypes.string_at(0)\n\nstrike()\n"
     (tmp_path / "striking.py").write_text(plugin)
     code = "import sys; sys.argv = ['servobench', 'tasks']\n"
-    code += (
-        "import servobench.harness.cli.main as main; main.command_line = lambda *_: __import__('striking')\nmain.main()"
-    )
+    code += "import servobench.harness.cli.main as main\n"
+    code += "main.command_line = lambda *_: __import__('striking')\n"
+    code += "main.main()"
     ended = python("-c", code, path=tmp_path)
     assert ended.returncode == -signal.SIGSEGV
     assert f'File "{tmp_path / "striking.py"}", line 4 in strike' in ended.stderr
 
 
-def test_a_backend_for_windows_and_a_wrong_epoch_leave_no_traceback(refusal_of, tmp_path, monkeypatch):
+def test_a_backend_for_windows_and_a_wrong_epoch_leave_no_traceback(
+    refusal_of, tmp_path, monkeypatch
+):
     words = ("run", "constant", "--plant", "kinematic", *EXP2[:2], "--out", tmp_path / "out")
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "abc")
     line = "servobench: SOURCE_DATE_EPOCH must be a whole number of seconds since 1970, got 'abc'; unset it\n"
     assert refusal_of(*words) == line
-    drawn = python("-m", "servobench", *words, path=tmp_path, MPLBACKEND="nonsense", SOURCE_DATE_EPOCH="")
+    drawn = python(
+        "-m", "servobench", *words, path=tmp_path, MPLBACKEND="nonsense", SOURCE_DATE_EPOCH=""
+    )
     assert (drawn.returncode, drawn.stderr) == (0, "")
     assert "6 figures in" in drawn.stdout
 
@@ -148,7 +156,9 @@ def test_threads_that_the_system_refuses_are_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
     assert servobench(monkeypatch, "compare", "--controllers", "constant", "--out", "none") == 1
-    assert capsys.readouterr().err.startswith("servobench: no more threads or processes may be started here")
+    assert capsys.readouterr().err.startswith(
+        "servobench: no more threads or processes may be started here"
+    )
 
 
 def test_a_script_without_a_guard_ends_with_the_line_alone(tmp_path):
@@ -157,4 +167,6 @@ def test_a_script_without_a_guard_ends_with_the_line_alone(tmp_path):
     ended = python(script)
     assert ended.returncode == 1
     assert ended.stdout == ""
-    assert re.fullmatch("the worker processes cannot be started; a script .*__main__':`\n", ended.stderr)
+    assert re.fullmatch(
+        "the worker processes cannot be started; a script .*__main__':`\n", ended.stderr
+    )

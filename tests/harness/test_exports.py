@@ -15,7 +15,13 @@ from servobench.plant.contract.faults import ConfigurationError
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("exports") / "results"
-    compare(["constant", "broyden"], tasks=["target"], seeds=[1], out=out, settings={"target": {"duration": 1.0}})
+    compare(
+        ["constant", "broyden"],
+        tasks=["target"],
+        seeds=[1],
+        out=out,
+        settings={"target": {"duration": 1.0}},
+    )
     return out
 
 
@@ -25,8 +31,13 @@ def test_csv_holds_every_digit_of_every_run(folder, tmp_path):
     whole = load(folder).steps
     for name, steps in whole.groupby("run_id"):
         back = pd.read_csv(tmp_path / "csv" / f"{name}.csv")
-        pd.testing.assert_frame_equal(back, steps.reset_index(drop=True), check_dtype=False, check_exact=True)
-    assert pd.read_csv(tmp_path / "csv" / "runs.csv")["run_id"].tolist() == load(folder).runs["run_id"].tolist()
+        pd.testing.assert_frame_equal(
+            back, steps.reset_index(drop=True), check_dtype=False, check_exact=True
+        )
+    assert (
+        pd.read_csv(tmp_path / "csv" / "runs.csv")["run_id"].tolist()
+        == load(folder).runs["run_id"].tolist()
+    )
 
 
 def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
@@ -39,9 +50,15 @@ def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
             (metadata,) = reader.iter_metadata()
             assert metadata.metadata["outcome"] == run["outcome"]
             messages = list(reader.iter_messages(topics=["/feature"]))
-        assert [message.log_time for _, _, message in messages] == [k * 50_000_000 for k in range(len(steps))]
-        features = np.array([[json.loads(each.data)[f"{axis}_m"] for axis in "xyz"] for _, _, each in messages])
-        np.testing.assert_array_equal(features, steps[[f"feature_{axis}_m" for axis in "xyz"]].to_numpy())
+        assert [message.log_time for _, _, message in messages] == [
+            k * 50_000_000 for k in range(len(steps))
+        ]
+        features = np.array(
+            [[json.loads(each.data)[f"{axis}_m"] for axis in "xyz"] for _, _, each in messages]
+        )
+        np.testing.assert_array_equal(
+            features, steps[[f"feature_{axis}_m" for axis in "xyz"]].to_numpy()
+        )
         schema, channel, _ = messages[0]
         assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
 

@@ -17,7 +17,14 @@ from servobench.harness.batch import results
 from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import draw_joint_motion, draw_moves, draw_tracking
-from servobench.harness.pictures.style import SETTLED, divisions, figure_style, method_styles, panel_grid, save_figure
+from servobench.harness.pictures.style import (
+    SETTLED,
+    divisions,
+    figure_style,
+    method_styles,
+    panel_grid,
+    save_figure,
+)
 from servobench.harness.pictures.tracks import Track, load_ensembles, quantile, shown_until
 
 STYLES = method_styles(METHODS)
@@ -30,7 +37,10 @@ def load(folder, rows, steps):
 
 def seeds_of(folder, factors, name="ukf_mfac", task="exp1", **values):
     """Return the ensemble of runs whose errors are those of `made_up_steps` times a factor."""
-    rows = [made_up_row(f"r{i}", seed=i, controller=name, task=task, **values) for i in range(len(factors))]
+    rows = [
+        made_up_row(f"r{i}", seed=i, controller=name, task=task, **values)
+        for i in range(len(factors))
+    ]
     steps = [made_up_steps(f"r{i}") for i in range(len(factors))]
     for table, factor in zip(steps, factors, strict=True):
         table["error_norm"] *= factor
@@ -56,8 +66,13 @@ def test_a_run_that_ended_is_infinitely_far_in_a_quantile():
 
 def test_runs_that_ended_before_their_first_period_count_in_curve_and_mark(tmp_path):
     rows = [made_up_row(f"r{i}", seed=i) for i in range(2)]
-    rows += [made_up_row(f"r{i}", seed=i, status="crashed", periods=0, settling_time_s=np.nan) for i in range(2, 5)]
-    ensemble = load(tmp_path / "out", rows, [made_up_steps("r0"), made_up_steps("r1")])["exp1"]["ukf_mfac"]
+    rows += [
+        made_up_row(f"r{i}", seed=i, status="crashed", periods=0, settling_time_s=np.nan)
+        for i in range(2, 5)
+    ]
+    ensemble = load(tmp_path / "out", rows, [made_up_steps("r0"), made_up_steps("r1")])["exp1"][
+        "ukf_mfac"
+    ]
     assert len(ensemble.error) == 5
     assert np.isinf(quantile(ensemble.error, 0.5)).all()
     assert ensemble.settling_time == math.inf
@@ -79,7 +94,9 @@ def test_the_error_over_time_is_the_median_of_all_seeds_and_a_band(tmp_path):
 
 
 def test_a_run_that_ended_early_takes_its_seed_out_of_the_median(tmp_path):
-    rows = [made_up_row(f"r{i}", seed=i, status="completed" if i else "feature_lost") for i in range(3)]
+    rows = [
+        made_up_row(f"r{i}", seed=i, status="completed" if i else "feature_lost") for i in range(3)
+    ]
     steps = [made_up_steps(f"r{i}", periods=60 if i else 5) for i in range(3)]
     (ensemble,) = load(tmp_path / "out", rows, steps)["exp1"].values()
     assert np.isinf(ensemble.error[0, 5:]).all()
@@ -96,11 +113,17 @@ def test_a_move_is_shown_until_its_slowest_method_has_settled_and_then_half_as_l
     assert shown_until(never) == 59 * 0.05
 
 
-@pytest.mark.parametrize("mismatch", ["moderate+camera_move=45deg", "moderate+word_of_another_version=3deg"])
+@pytest.mark.parametrize(
+    "mismatch", ["moderate+camera_move=45deg", "moderate+word_of_another_version=3deg"]
+)
 def test_a_camera_that_moved_is_marked_and_the_whole_move_is_shown(tmp_path, mismatch):
     drawn = json.dumps({"move_angle": 0.785})
-    write_folder(tmp_path, [made_up_row("a", mismatch=mismatch, mismatch_values=drawn)], [made_up_steps("a")])
-    manifest = results.read_manifest(tmp_path) | {"configuration": {"run": {"camera_moves_at": 0.5}}}
+    write_folder(
+        tmp_path, [made_up_row("a", mismatch=mismatch, mismatch_values=drawn)], [made_up_steps("a")]
+    )
+    manifest = results.read_manifest(tmp_path) | {
+        "configuration": {"run": {"camera_moves_at": 0.5}}
+    }
     results.write_manifest(tmp_path, manifest)
     ensembles = load_ensembles(tmp_path, results.load_runs(tmp_path))
     assert shown_until(ensembles["exp1"]) == 59 * 0.05
@@ -111,18 +134,26 @@ def test_a_camera_that_moved_is_marked_and_the_whole_move_is_shown(tmp_path, mis
 def test_methods_as_published_have_a_panel_of_their_own_beside_the_upper_bounds(tmp_path):
     assert divisions(["ukf_mfac", "rls", "calibrated"]) == {"": ["ukf_mfac", "rls", "calibrated"]}
     names = ["ukf_mfac", "ukf_mfac:published", "calibrated"]
-    wanted = {"with aids": ["ukf_mfac", "calibrated"], "as published": ["ukf_mfac:published", "calibrated"]}
+    wanted = {
+        "with aids": ["ukf_mfac", "calibrated"],
+        "as published": ["ukf_mfac:published", "calibrated"],
+    }
     assert divisions(names) == wanted
     assert divisions(names[1:]) == {"": names[1:]}
-    assert list(divisions([*names, "Mine"])) == ["others", "as published"]  # a class of a user's may have none
+    # A class of a user's may have none
+    assert list(divisions([*names, "Mine"])) == ["others", "as published"]
 
     run_ids = [name.replace(":", ".") for name in names]
-    rows = [made_up_row(run_id, controller=name) for run_id, name in zip(run_ids, names, strict=True)]
+    rows = [
+        made_up_row(run_id, controller=name) for run_id, name in zip(run_ids, names, strict=True)
+    ]
     ensembles = load(tmp_path / "out", rows, [made_up_steps(run_id) for run_id in run_ids])
     panels = draw_moves(ensembles, STYLES).axes
     assert [axes.get_title() for axes in panels] == ["exp1, with aids", "exp1, as published"]
     for axes, labels in zip(panels, wanted.values(), strict=True):
-        assert [line.get_label() for line in axes.get_lines() if line.get_label() in names] == labels
+        assert [
+            line.get_label() for line in axes.get_lines() if line.get_label() in names
+        ] == labels
     equipped, published = STYLES["ukf_mfac"], STYLES["ukf_mfac:published"]
     assert equipped.colour == published.colour
     assert (equipped.line, equipped.hollow, published.hollow) == ("-", False, True)
@@ -132,12 +163,16 @@ def test_many_methods_are_divided_evenly_with_the_bounds_in_each_part():
     many = [f"method_{i}" for i in range(10)]
     parts = divisions([*many, "calibrated"])
     assert parts == {"1 of 2": [*many[:5], "calibrated"], "2 of 2": [*many[5:], "calibrated"]}
-    assert list(divisions([*many, "ukf_mfac:published"])) == [f"others {k} of 2" for k in (1, 2)] + ["as published"]
+    assert list(divisions([*many, "ukf_mfac:published"])) == [
+        f"others {k} of 2" for k in (1, 2)
+    ] + ["as published"]
 
 
 def test_along_a_curve_the_error_is_a_root_mean_square_over_half_a_second(tmp_path):
     steps = made_up_steps("a", curve=True).assign(error_norm=np.tile([0.003, 0.004], 30))
-    ensembles = load(tmp_path / "out", [made_up_row("a", task="circle", task_kind="curve")], [steps])["circle"]
+    ensembles = load(
+        tmp_path / "out", [made_up_row("a", task="circle", task_kind="curve")], [steps]
+    )["circle"]
     figure = draw_tracking(ensembles, {"ukf_mfac": Track(made_up_row("a"), steps)}, STYLES)
     (line,) = lines_of(figure.axes[0], "ukf_mfac")
     np.testing.assert_allclose(line.get_ydata()[9:], np.sqrt(12.5))
@@ -152,7 +187,10 @@ def test_paths_are_drawn_to_scale_in_two_views_that_share_the_abscissa():
     assert front.get_xlim() == side.get_xlim()
     assert front.yaxis_inverted()
     assert side.yaxis_inverted()  # the camera hangs above and looks down
-    assert [axes.get_ylabel() for axes in (front, side)] == ["y, downwards [m]", "z, depth downwards [m]"]
+    assert [axes.get_ylabel() for axes in (front, side)] == [
+        "y, downwards [m]",
+        "z, depth downwards [m]",
+    ]
     for axes, row in ((front, 1), (side, 2)):
         (start,), (target,) = lines_of(axes, "start"), lines_of(axes, "target")
         assert (start.get_xdata()[0], start.get_ydata()[0]) == pytest.approx((0.3, 0.1 * row + 0.3))
@@ -164,15 +202,22 @@ def test_a_desired_curve_and_its_direction_are_drawn():
     tracks = {"ukf_mfac": Track(row, made_up_steps("a", curve=True))}
     for axes in draw_paths({"circle": tracks}, STYLES).axes:
         assert len(lines_of(axes, "desired")[0].get_xdata()) == 60
-        assert any(hasattr(text, "arrow_patch") and text.arrow_patch is not None for text in axes.texts)
+        assert any(
+            hasattr(text, "arrow_patch") and text.arrow_patch is not None for text in axes.texts
+        )
 
 
 def test_speed_acceleration_and_jerk_of_every_joint_stand_side_by_side_in_a_row_a_method():
     steps = made_up_steps("a").assign(joint_velocity_command_lift_rad_s=np.tile([1.0, -1.0], 30))
     row = made_up_row("a", command_switches=59.0, joint_jerk_rms_rad_s3=1131.4)
-    figure = draw_joint_motion({"ukf_mfac": Track(row, steps), "rls": Track(row, made_up_steps("b"))}, 2.0)
+    figure = draw_joint_motion(
+        {"ukf_mfac": Track(row, steps), "rls": Track(row, made_up_steps("b"))}, 2.0
+    )
     speed, acceleration, jerk = figure.axes[:3]
-    peaks = [float(np.abs(lines_of(axes, "lift")[0].get_ydata()).max()) for axes in (speed, acceleration, jerk)]
+    peaks = [
+        float(np.abs(lines_of(axes, "lift")[0].get_ydata()).max())
+        for axes in (speed, acceleration, jerk)
+    ]
     assert peaks == pytest.approx([1.0, 40.0, 1600.0])
     assert speed.texts[0].get_text() == "59 sign switches"
     assert jerk.texts[0].get_text() == "RMS 1.13e+03"
@@ -187,18 +232,24 @@ def test_steps_longer_than_the_period_are_marked_and_counted(tmp_path):
     ensembles = load(tmp_path / "out", rows, [made_up_steps("ukf_mfac"), slow])
     (axes,) = draw_step_times(ensembles, STYLES).axes
     texts = [text.get_text() for text in axes.texts]
-    assert [text for text in texts if "too slow" in text] == ["132 µs, 60 ms, 60 ms\n2 of 60 too slow"]
+    assert [text for text in texts if "too slow" in text] == [
+        "132 µs, 60 ms, 60 ms\n2 of 60 too slow"
+    ]
     assert "control period, 50 ms" in texts
 
 
 def test_moves_that_never_settled_stand_at_the_edge_and_are_counted():
     times = [1.0, 2.0, math.nan, 3.0]
-    runs = pd.DataFrame([made_up_row(str(i), seed=i, settling_time_s=time) for i, time in enumerate(times)])
+    runs = pd.DataFrame(
+        [made_up_row(str(i), seed=i, settling_time_s=time) for i, time in enumerate(times)]
+    )
     figure = draw_measures(runs, "settling", STYLES)
     axes = figure.axes[0]
     assert [text.get_text() for text in axes.texts] == ["1 of 4"]
     points, middle = axes.get_lines()
-    assert np.asarray(points.get_xdata()).tolist() == pytest.approx([1.0, 2.0, axes.get_xlim()[1], 3.0])
+    assert np.asarray(points.get_xdata()).tolist() == pytest.approx(
+        [1.0, 2.0, axes.get_xlim()[1], 3.0]
+    )
     assert middle.get_xdata()[0] == 2.5
     assert "never settled" in figure.get_supxlabel()
 
@@ -254,7 +305,9 @@ def test_settling_times_of_equal_methods_stand_side_by_side_below_the_band(tmp_p
     axes = draw_moves({"exp1": ensembles}, method_styles(list(times))).axes[0]
     marks = [line for line in axes.get_lines() if line.get_gid() == SETTLED]
     places = [mark.get_transform().transform(mark.get_xydata())[0] for mark in marks]
-    assert np.diff(places, axis=0)[:2] == pytest.approx(np.array([[6.5, 0.0]] * 2) * axes.figure.dpi / 72)
+    assert np.diff(places, axis=0)[:2] == pytest.approx(
+        np.array([[6.5, 0.0]] * 2) * axes.figure.dpi / 72
+    )
     band = axes.transData.transform([(1.5, 5.0)])[0]
     assert places[3][0] == pytest.approx(band[0])
     assert all(y < band[1] for _, y in places)

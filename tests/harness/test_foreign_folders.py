@@ -26,9 +26,28 @@ from servobench.plant.contract import files
 from servobench.plant.contract.checksums import SUMS, write_vouched
 
 RUN = "kinematic-constant-exp1-moderate-0"
-TEXTS = ("plant", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit", "outcome", "reason")
+TEXTS = (
+    "plant",
+    "task",
+    "mismatch",
+    "robot",
+    "sensing",
+    "engine",
+    "task_kind",
+    "feature_unit",
+    "outcome",
+    "reason",
+)
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
-PAYLOADS = ("../../escaped", "/ELSEWHERE/escaped", "=cmd|'/C calc'!A1", "$(touch escaped)", "<b>", "x\n## y", "%s{0}")
+PAYLOADS = (
+    "../../escaped",
+    "/ELSEWHERE/escaped",
+    "=cmd|'/C calc'!A1",
+    "$(touch escaped)",
+    "<b>",
+    "x\n## y",
+    "%s{0}",
+)
 
 
 def row(**values: object) -> dict[str, object]:
@@ -101,7 +120,9 @@ COMMANDS = (
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(kind, tmp_path, monkeypatch, capsys):
+def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(
+    kind, tmp_path, monkeypatch, capsys
+):
     for name in ("home", "temporary", "out"):
         (tmp_path / name).mkdir()
     folder, victim = tmp_path / "home" / "folder", tmp_path / "home" / "victim.csv"
@@ -112,13 +133,20 @@ def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(kind, tmp_path
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])  # those of `figures`
-    allowed = [os.path.realpath(tmp_path / name) for name in ("home/folder", "temporary", "cache", "out")]
+    # Those of `figures`
+    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])
+    allowed = [
+        os.path.realpath(tmp_path / name) for name in ("home/folder", "temporary", "cache", "out")
+    ]
     for command in COMMANDS:
         with noting() as noted:
             code = servobench(monkeypatch, *command.format(folder).split())
         said = capsys.readouterr()
-        outside = [each for each in noted if not any(f"{each[1]}/".startswith(f"{root}/") for root in allowed)]
+        outside = [
+            each
+            for each in noted
+            if not any(f"{each[1]}/".startswith(f"{root}/") for root in allowed)
+        ]
         assert [each for each in outside if each[1] != os.devnull] == [], command
         if kind not in ACCEPTED:
             assert code in (1, 2) if command.startswith("verify") else code == 2, (command, said)
@@ -127,8 +155,12 @@ def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(kind, tmp_path
     assert not list(tmp_path.rglob("escaped*"))
 
 
-@pytest.mark.parametrize("command", ["verify {}", "export {} --out {}/../csv", "merge {} --out {}/../m", "collect {}"])
-def test_a_run_that_is_called_as_the_table_of_runs_is_refused_by_every_command(refusal_of, tmp_path, command):
+@pytest.mark.parametrize(
+    "command", ["verify {}", "export {} --out {}/../csv", "merge {} --out {}/../m", "collect {}"]
+)
+def test_a_run_that_is_called_as_the_table_of_runs_is_refused_by_every_command(
+    refusal_of, tmp_path, command
+):
     folder = signed(tmp_path / "folder", run_id="runs")
     assert "'runs', is a name of its folder" in refusal_of(*command.format(folder, folder).split())
     assert [each.name for each in tmp_path.iterdir()] == ["folder"]
@@ -154,19 +186,27 @@ def test_no_picture_is_merged_to_a_place_that_a_run_names(refusal_of, tmp_path):
 
 def test_a_spreadsheet_runs_no_cell_of_an_export(tmp_path, monkeypatch):
     worded(tmp_path / "folder", tmp_path)
-    assert servobench(monkeypatch, "export", str(tmp_path / "folder"), "--out", str(tmp_path / "csv")) == 0
+    assert (
+        servobench(monkeypatch, "export", str(tmp_path / "folder"), "--out", str(tmp_path / "csv"))
+        == 0
+    )
     runs = pd.read_csv(tmp_path / "csv" / "runs.csv")
     assert runs.loc[0, "controller"] == "'=cmd|'/C calc'!A1"
     assert runs.loc[0, "'=1+1"] == "'@x"
-    assert not runs.map(lambda cell: isinstance(cell, str) and cell.startswith(FORMULA)).any(axis=None)
+    assert not runs.map(lambda cell: isinstance(cell, str) and cell.startswith(FORMULA)).any(
+        axis=None
+    )
     assert runs.loc[0, "seed"] == 0
 
 
 @pytest.mark.parametrize(
-    "end", ["\r", "\r\n", "\n", "\x0b", "\x0c", "\x1c", "\x85", "\u2028", "\u2029", ";", "\t", "\x00\r"]
+    "end",
+    ["\r", "\r\n", "\n", "\x0b", "\x0c", "\x1c", "\x85", "\u2028", "\u2029", ";", "\t", "\x00\r"],
 )
 def test_no_text_of_an_export_begins_a_row_or_a_formula(end, tmp_path):
-    table = pd.DataFrame({"reason": [f'a{end}=HYPERLINK("http://x","y")', "plain, text"], "seed": [1, 2]})
+    table = pd.DataFrame(
+        {"reason": [f'a{end}=HYPERLINK("http://x","y")', "plain, text"], "seed": [1, 2]}
+    )
     files.write_csv(table, tmp_path / "runs.csv")
     text = (tmp_path / "runs.csv").read_bytes().decode()
     rows = list(csv.reader(io.StringIO(text, newline="")))
@@ -175,7 +215,9 @@ def test_no_text_of_an_export_begins_a_row_or_a_formula(end, tmp_path):
     lines = text.splitlines()
     assert len(lines) == 3 + end.endswith("\n")  # within quotes
     for mark in ";\t":
-        assert not any(cell.startswith(FORMULA) for line in rows for cell in ",".join(line).split(mark))
+        assert not any(
+            cell.startswith(FORMULA) for line in rows for cell in ",".join(line).split(mark)
+        )
 
 
 BOMB = pa.table(dict.fromkeys(map("x{}".format, range(30)), pa.nulls(10**6, pa.float64())))
@@ -211,9 +253,13 @@ def test_a_table_of_wrong_columns_is_one_line(refusal_of, monkeypatch, kind, tmp
     assert re.search(words, refusal_of("statistics", folder))
 
 
-def rewritten(name: str, change: Callable[[pd.DataFrame], pd.DataFrame]) -> Callable[[Path], object]:
+def rewritten(
+    name: str, change: Callable[[pd.DataFrame], pd.DataFrame]
+) -> Callable[[Path], object]:
     """Return what changes a table of a folder, with a checksum that fits."""
-    return lambda folder: write_vouched(folder, {name: change(pd.read_parquet(folder / name)).to_parquet})
+    return lambda folder: write_vouched(
+        folder, {name: change(pd.read_parquet(folder / name)).to_parquet}
+    )
 
 
 def manifest(**values: object) -> Callable[[Path], object]:
@@ -233,7 +279,12 @@ def part_behind_the_last_run(folder: Path) -> None:
     for name in (results.RUNS, results.STEPS):
         content = (folder / name).read_bytes()
         write_vouched(
-            folder, {results.part_name(99_999_999, name): lambda file, content=content: file.write_bytes(content)}
+            folder,
+            {
+                results.part_name(99_999_999, name): lambda file, content=content: file.write_bytes(
+                    content
+                )
+            },
         )
         (folder / name).unlink()
     manifest(run_count=2)(folder)
@@ -251,7 +302,9 @@ def differing_parts(folder: Path) -> None:
     (folder / results.PARTS).mkdir()
     for index, value in enumerate((0.5, True)):
         run = row() | {"run_id": f"b{index}"}
-        results.write_part(folder, index, [RunResult(run, made_up_steps(f"b{index}").assign(jacobian_error=value))])
+        results.write_part(
+            folder, index, [RunResult(run, made_up_steps(f"b{index}").assign(jacobian_error=value))]
+        )
     for name in (results.RUNS, results.STEPS):
         (folder / name).unlink()
 
@@ -260,7 +313,9 @@ def large_numbers(folder: Path) -> None:
     """Put a whole number into one part that has no place among the floats of the other."""
     differing_parts(folder)
     name = results.part_name(1, results.STEPS)
-    write_vouched(folder, {name: pd.read_parquet(folder / name).assign(jacobian_error=2**63 - 1).to_parquet})
+    write_vouched(
+        folder, {name: pd.read_parquet(folder / name).assign(jacobian_error=2**63 - 1).to_parquet}
+    )
 
 
 def table_beside(table: pa.Table) -> Callable[[Path], object]:
@@ -304,8 +359,15 @@ ODD = {  # what a folder holds: the command, its exit code, and words of its one
 def test_an_odd_folder_is_read_or_refused_in_one_line(kind, tmp_path, monkeypatch, capsys):
     make, command, code, words = ODD[kind]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])  # which take seconds
-    make(comparison(tmp_path / "folder", ("constant",), ("exp1", "exp2", "circle")[: 1 + 2 * ("seed" in kind)]))
+    # Which take seconds
+    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])
+    make(
+        comparison(
+            tmp_path / "folder",
+            ("constant",),
+            ("exp1", "exp2", "circle")[: 1 + 2 * ("seed" in kind)],
+        )
+    )
     assert servobench(monkeypatch, *command.format("folder").split()) == code, capsys.readouterr()
     said = capsys.readouterr()
     assert words in said.out + said.err
@@ -316,13 +378,17 @@ def test_checksums_of_files_elsewhere_are_not_looked_at(output_of, tmp_path):
     folder = signed(tmp_path / "folder")
     with (folder / SUMS).open("a") as sums:
         sums.writelines(
-            f"{'0' * 64}  {name}\n" for name in ("/dev/zero", "../victim", "parts/../../victim", "a\0b", "..")
+            f"{'0' * 64}  {name}\n"
+            for name in ("/dev/zero", "../victim", "parts/../../victim", "a\0b", "..")
         )
     assert "3 files are as they were written" in output_of("verify", folder)
 
 
 def test_a_terminal_obeys_no_word_of_a_folder(output_of, tmp_path):
-    rows = [made_up_row(f"{RUN}-{seed}", controller="a\x1b]0;b\x07\u202ec", seed=seed) for seed in range(2)]
+    rows = [
+        made_up_row(f"{RUN}-{seed}", controller="a\x1b]0;b\x07\u202ec", seed=seed)
+        for seed in range(2)
+    ]
     write_folder(tmp_path / "folder", rows, [])
     for form in ((), ("--markdown",), ("--json",), ("--latex",)):
         said = output_of("statistics", tmp_path / "folder", *form)
@@ -331,6 +397,9 @@ def test_a_terminal_obeys_no_word_of_a_folder(output_of, tmp_path):
 
 
 def test_controllers_that_share_no_seed_are_no_pair(output_of, tmp_path):
-    rows = [made_up_row(f"{name}-{seed}", controller=name, seed=seed) for name, seed in (("a", 0), ("b", 1))]
+    rows = [
+        made_up_row(f"{name}-{seed}", controller=name, seed=seed)
+        for name, seed in (("a", 0), ("b", 1))
+    ]
     write_folder(tmp_path / "folder", rows, [])
     assert "a − b" not in output_of("statistics", tmp_path / "folder")

@@ -23,7 +23,9 @@ RENDERS = default_plant()[0] in RENDERED
 
 @pytest.mark.parametrize("sensing", ["position", "pixel:hand"])
 def test_an_episode_under_the_commands_of_a_run_is_that_run(sensing):
-    ran = run("ukf_mfac", task="random", mismatch="moderate+camera_move=5deg", sensing=sensing, seed=3)
+    ran = run(
+        "ukf_mfac", task="random", mismatch="moderate+camera_move=5deg", sensing=sensing, seed=3
+    )
     steps = ran.steps
     env = ServoEnv(task="random", mismatch="moderate+camera_move=5deg", sensing=sensing)
     _, info = env.reset(seed=3)
@@ -54,7 +56,9 @@ def test_an_environment_can_be_sent_to_another_process_before_and_during_an_epis
 
 
 def test_lanes_are_single_episodes_to_the_bit_and_are_reset_together():
-    many = gymnasium.make_vec(ENVIRONMENT, num_envs=3, vectorization_mode="vector_entry_point", task="exp1")
+    many = gymnasium.make_vec(
+        ENVIRONMENT, num_envs=3, vectorization_mode="vector_entry_point", task="exp1"
+    )
     singles = [ServoEnv(task="exp1") for _ in range(3)]
     seen, info = many.reset(seed=5)
     assert info["seed"].tolist() == [5, 6, 7]
@@ -85,9 +89,12 @@ def test_lanes_are_single_episodes_to_the_bit_and_are_reset_together():
     np.testing.assert_array_equal(seen, [env.reset(seed=int(each))[0] for env, each in pairs])
     later = many.reset()[1]["seed"]
     assert many.reset(seed=np.array([11, 5, 3]))[1]["seed"].tolist() == [11, 5, 3]
-    assert many.reset(seed=(11, 5, None))[1]["seed"].tolist() == info["seed"].tolist()  # the third is drawn likewise
+    # The third is drawn likewise
+    assert many.reset(seed=(11, 5, None))[1]["seed"].tolist() == info["seed"].tolist()
     assert many.reset()[1]["seed"].tolist() == later.tolist()
-    with pytest.raises(ConfigurationError, match="seed must be a number or a list of 3, got 2 seeds"):
+    with pytest.raises(
+        ConfigurationError, match="seed must be a number or a list of 3, got 2 seeds"
+    ):
         many.reset(seed=[1, 2])
     many.close()
 
@@ -152,7 +159,9 @@ def test_nothing_is_rendered_unless_it_is_asked_for():
     env.reset(seed=1)
     assert env.render() is None
     env.close()
-    with pytest.raises(ConfigurationError, match="render_mode must be rgb_array or None, got 'human'"):
+    with pytest.raises(
+        ConfigurationError, match="render_mode must be rgb_array or None, got 'human'"
+    ):
         ServoEnv(render_mode="human")
 
 
@@ -209,7 +218,9 @@ def test_an_action_that_is_none_is_refused_and_changes_nothing(lanes, action, wo
     env.close()
 
 
-@pytest.mark.parametrize("make", [lambda: ServoEnv(task="exp2"), lambda: ServoVectorEnv(2, task="exp2")])
+@pytest.mark.parametrize(
+    "make", [lambda: ServoEnv(task="exp2"), lambda: ServoVectorEnv(2, task="exp2")]
+)
 def test_options_and_seeds_that_cannot_be_used_are_refused(make):
     env = make()
     env.reset(seed=1, options={})
@@ -219,9 +230,13 @@ def test_options_and_seeds_that_cannot_be_used_are_refused(make):
         with pytest.raises(gymnasium.error.Error, match="Seed must be"):
             env.reset(seed=seed)
     if isinstance(env, ServoVectorEnv):
-        with pytest.raises(ConfigurationError, match=re.escape("seed must be at most 2**63 - 2, got")):
+        with pytest.raises(
+            ConfigurationError, match=re.escape("seed must be at most 2**63 - 2, got")
+        ):
             env.reset(seed=2**64)
-        with pytest.raises(ConfigurationError, match="seed must be a non-negative integer, got True"):
+        with pytest.raises(
+            ConfigurationError, match="seed must be a non-negative integer, got True"
+        ):
             env.reset(seed=True)
         env.reset(seed=[2**63 - 1, 0])  # each lane has its own; none is counted on
     env.close()
@@ -249,7 +264,9 @@ def test_version_0_still_gives_what_it_gave():
     env.reset(seed=0)
     rewards = [env.step(np.full(6, 0.1))[1] for _ in range(20)]
     assert ENVIRONMENT.endswith("-v0")
-    np.testing.assert_allclose([rewards[0], sum(rewards)], [-0.028570258752639313, -0.5935999997431326], rtol=1e-9)
+    np.testing.assert_allclose(
+        [rewards[0], sum(rewards)], [-0.028570258752639313, -0.5935999997431326], rtol=1e-9
+    )
     env.close()
 
 
@@ -262,7 +279,9 @@ def test_processes_find_the_environment_however_they_are_started(method):
 
 
 def test_the_specification_tells_the_length_of_an_episode():
-    env = TimeAwareObservation(gymnasium.make(ENVIRONMENT, task="exp2", settings={"exp2": {"duration": 0.2}}))
+    env = TimeAwareObservation(
+        gymnasium.make(ENVIRONMENT, task="exp2", settings={"exp2": {"duration": 0.2}})
+    )
     assert env.spec.max_episode_steps == 4
     env.reset(seed=1)
     ends = [env.step(np.zeros(6))[2:4] for _ in range(4)]
@@ -271,12 +290,17 @@ def test_the_specification_tells_the_length_of_an_episode():
     assert again.spec.max_episode_steps == 4
     many = gymnasium.make_vec(again.spec, num_envs=2, vectorization_mode="vector_entry_point")
     assert many.unwrapped.single_observation_space == again.observation_space
-    with pytest.raises(ConfigurationError, match="max_episode_steps must be 4, as the task has so many periods, got 5"):
+    with pytest.raises(
+        ConfigurationError,
+        match="max_episode_steps must be 4, as the task has so many periods, got 5",
+    ):
         ServoVectorEnv(2, task="exp2", settings={"exp2": {"duration": 0.2}}, max_episode_steps=5)
 
 
 def test_an_argument_that_is_a_setting_is_refused_with_the_place_of_settings():
-    with pytest.raises(ConfigurationError, match=r"no argument 'latency'; settings=\{'kinematic': \{\.\.\.\}\} has"):
+    with pytest.raises(
+        ConfigurationError, match=r"no argument 'latency'; settings=\{'kinematic': \{\.\.\.\}\} has"
+    ):
         gymnasium.make(ENVIRONMENT, latency=0.1)
     env = ServoEnv(settings={"kinematic": {"sensing.latency": 0.1, "lag": 0.02}})
     assert env.resolved.plant.sensing.latency == 0.1

@@ -25,7 +25,11 @@ def _a_terminal_of_80_columns(monkeypatch):
 
 def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_columns(output_of):
     text = output_of()
-    listed = [line[2:13].strip() for line in text.partition("First steps")[2].splitlines() if line.startswith("│")]
+    listed = [
+        line[2:13].strip()
+        for line in text.partition("First steps")[2].splitlines()
+        if line.startswith("│")
+    ]
     assert listed == list(ROOT.commands)
     assert listed[:2] == ["run", "compare"]
     assert listed[-1] == "fmu"
@@ -69,7 +73,9 @@ def test_no_word_in_brackets_is_taken_for_markup(output_of, monkeypatch):
 
 
 def test_version_and_commit_are_told(output_of):
-    assert re.fullmatch(r"servobench \d\S*( \(commit [0-9a-f]{12}(, with changes)?\))?\n", output_of("--version"))
+    assert re.fullmatch(
+        r"servobench \d\S*( \(commit [0-9a-f]{12}(, with changes)?\))?\n", output_of("--version")
+    )
 
 
 def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
@@ -84,7 +90,12 @@ def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
 COLOUR = Value("COLOUR", lambda incomplete: [incomplete + "ed"], lambda text: 2 * text)
 
 
-def paint(*, shade: Annotated[str, named_option("--colour", COLOUR, "Shade of it.", {"wash": "no paint"})] = "blue"):
+def paint(
+    *,
+    shade: Annotated[
+        str, named_option("--colour", COLOUR, "Shade of it.", {"wash": "no paint"})
+    ] = "blue",
+):
     typer.echo(shade)
 
 

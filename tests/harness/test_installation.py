@@ -25,7 +25,9 @@ def checkout(tmp_path):
 
 
 def git(folder, *words):
-    return subprocess.run(["git", *words], cwd=folder, check=True, capture_output=True, text=True).stdout.strip()
+    return subprocess.run(
+        ["git", *words], cwd=folder, check=True, capture_output=True, text=True
+    ).stdout.strip()
 
 
 def test_the_commit_is_that_of_the_own_checkout_even_below_a_hook_of_another(checkout, monkeypatch):
@@ -61,7 +63,10 @@ def points_nowhere(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (belongs_to_another, r"^the checkout belongs to another user; git config --global --add safe\.directory /"),
+        (
+            belongs_to_another,
+            r"^the checkout belongs to another user; git config --global --add safe\.directory /",
+        ),
         (has_no_git, "^git cannot be run: No such file"),
         (has_a_damaged_index, "^git says: .*index file"),
         (points_nowhere, "^git says: not a git repository: /nowhere/at/all"),
@@ -78,18 +83,26 @@ def test_the_version_says_why_the_commit_is_unknown(checkout, monkeypatch):
     monkeypatch.setattr(installation, "CHECKOUT", checkout("own"))
     monkeypatch.setattr(installation, "read_checkout", installation.read_checkout.__wrapped__)
     monkeypatch.setenv("PATH", "")
-    assert version_line().endswith(" (commit unknown: git cannot be run: No such file or directory)")
+    assert version_line().endswith(
+        " (commit unknown: git cannot be run: No such file or directory)"
+    )
 
 
 def test_the_loaded_blas_is_named_with_its_version_kernel_and_threads():
-    told = [(each["name"], each["version"], each["threads"], each["kernel"]) for each in blas_libraries()]
+    told = [
+        (each["name"], each["version"], each["threads"], each["kernel"])
+        for each in blas_libraries()
+    ]
     known = [each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas"]
     assert told == [
-        (each["internal_api"], each["version"], each["num_threads"], each.get("architecture")) for each in known
+        (each["internal_api"], each["version"], each["num_threads"], each.get("architecture"))
+        for each in known
     ]
 
 
 def test_a_blas_that_cannot_be_asked_has_the_name_that_numpy_was_built_with(monkeypatch):
     monkeypatch.setattr(threadpoolctl, "threadpool_info", list)
     built = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
-    assert blas_libraries() == [{"name": built["name"], "version": built["version"], "threads": None, "kernel": None}]
+    assert blas_libraries() == [
+        {"name": built["name"], "version": built["version"], "threads": None, "kernel": None}
+    ]

@@ -48,10 +48,16 @@ class Stop(Notes):
 def run(folder, observer=None, *, resume=False, seeds=range(RUNS), steps=False) -> Notes:
     batch = Batch(("kinematic",), ("constant",), ("random",), ("moderate",), seeds)
     settings = Settings(
-        {"random": {"duration": 0.3}, "run": {"lost_after": 0.05}, "kinematic": {"sensing": {"drop_probability": 0.1}}}
+        {
+            "random": {"duration": 0.3},
+            "run": {"lost_after": 0.05},
+            "kinematic": {"sensing": {"drop_probability": 0.1}},
+        }
     )
     observer = observer or Notes()
-    how = Execution(workers=1, resume=resume, observer=observer, block=1, bounds=Bounds(isolate=False))
+    how = Execution(
+        workers=1, resume=resume, observer=observer, block=1, bounds=Bounds(isolate=False)
+    )
     carry_out(Campaign(SweepPlan(batch).cells(), settings, steps), folder, how)
     return observer
 
@@ -67,7 +73,9 @@ def whole(tmp_path_factory):
     return folder
 
 
-def test_verify_covers_the_files_beside_the_tables_and_names_the_rest(output_of, tmp_path, monkeypatch):
+def test_verify_covers_the_files_beside_the_tables_and_names_the_rest(
+    output_of, tmp_path, monkeypatch
+):
     folder = tmp_path / "out"
     run(folder, steps=True)
     for name in ("figures/paths.png", "report.html"):
@@ -78,7 +86,9 @@ def test_verify_covers_the_files_beside_the_tables_and_names_the_rest(output_of,
     run(folder / "inside", seeds=range(2))
     found = examine(folder)
     assert (found.findings, found.left_out) == ([], ["inside/", "notes.txt"])
-    assert "not checked, as SHA256SUMS does not list it: inside/, notes.txt\n" in output_of("verify", folder)
+    assert "not checked, as SHA256SUMS does not list it: inside/, notes.txt\n" in output_of(
+        "verify", folder
+    )
     (folder / "figures" / "paths.png").unlink()
     (folder / "report.html").write_text("other")
     assert [(each.name, each.fault) for each in examine(folder).findings] == [
@@ -137,9 +147,13 @@ def flip(path, seed=0):
 
 
 def assert_same(folder, whole):
-    pd.testing.assert_frame_equal(judged(results.load_runs(folder)), judged(results.load_runs(whole)), check_exact=True)
+    pd.testing.assert_frame_equal(
+        judged(results.load_runs(folder)), judged(results.load_runs(whole)), check_exact=True
+    )
     assert examine(folder).findings == []
-    assert sorted(path.name for path in folder.iterdir()) == sorted(path.name for path in whole.iterdir())
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        path.name for path in whole.iterdir()
+    )
     assert (folder / results.FAILURES).read_text() == (whole / results.FAILURES).read_text()
 
 
@@ -163,7 +177,9 @@ def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damage
     for _ in range(2):
         results.copy_parts([(folder, 0)], other)
         assert [path.name for path in (other / results.PICTURES).iterdir()] == [f"{runs[0]}.png"]
-    assert {results.part_name(0, results.RUNS), f"{results.PICTURES}/{runs[0]}.png"} <= read_sums(other).keys()
+    assert {results.part_name(0, results.RUNS), f"{results.PICTURES}/{runs[0]}.png"} <= read_sums(
+        other
+    ).keys()
     flip(folder / results.part_name(8, results.RUNS))
     with pytest.raises(DamagedFile, match=r"00000008\.runs\.parquet was changed"):
         results.copy_parts([(folder, 8)], other)
@@ -172,7 +188,9 @@ def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damage
 def test_more_runs_than_were_asked_for_are_of_another_folder():
     assert results.missing_line(3, 3) == ""
     assert results.missing_line(2, 3) == "2 of 3 runs are there: --resume carries out the others"
-    assert results.missing_line(4, 3).startswith("4 runs are there, and the manifest is of 3: a file of another folder")
+    assert results.missing_line(4, 3).startswith(
+        "4 runs are there, and the manifest is of 3: a file of another folder"
+    )
     assert results.missing_line(4, 0) == ""  # a folder that says nothing
 
 
@@ -181,7 +199,10 @@ def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(begun, wh
     part = begun / results.part_name(8, results.RUNS)
     DAMAGES[what](part)
     for command in (results.load_runs, results.collect):
-        with pytest.raises(DamagedFile, match=rf"00000008\.runs\.parquet {what}; repeat .* --resume, or type: servob"):
+        with pytest.raises(
+            DamagedFile,
+            match=rf"00000008\.runs\.parquet {what}; repeat .* --resume, or type: servob",
+        ):
             command(begun)
     found = examine(begun)
     (finding,) = found.findings
@@ -196,7 +217,9 @@ def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(begun, wh
 def test_a_part_with_the_rows_of_another_is_refused(begun, whole):
     first, second = (begun / results.part_name(index, results.RUNS) for index in (0, 8))
     shutil.copy(first, second)
-    assert [finding.fault for finding in examine(begun).findings] == ["was changed since it was written"]
+    assert [finding.fault for finding in examine(begun).findings] == [
+        "was changed since it was written"
+    ]
     (begun / SUMS).unlink()  # nothing vouches for it, but it says itself which rows it holds
     assert "holds the rows of other runs" in [finding.fault for finding in examine(begun).findings]
     assert run(begun, resume=True).repeated == 16
@@ -206,7 +229,10 @@ def test_a_part_with_the_rows_of_another_is_refused(begun, whole):
 def test_parts_without_checksums_are_read_and_kept(begun, whole):
     (begun / SUMS).unlink()
     (finding,) = examine(begun).findings
-    assert (finding.name, finding.fault) == (SUMS, "is missing, so that nothing vouches for the other files")
+    assert (finding.name, finding.fault) == (
+        SUMS,
+        "is missing, so that nothing vouches for the other files",
+    )
     assert len(results.load_runs(begun)) == RUNS - 8
     resumed = run(begun, resume=True)
     assert (resumed.repeated, resumed.notes) == (8, [])
@@ -224,11 +250,15 @@ def test_a_damaged_table_is_named_and_made_again(ended, whole, what):
     assert finding.remedy.endswith("--resume; runs that are in no part are repeated")
     resumed = run(ended, resume=True)
     assert resumed.repeated == RUNS
-    assert resumed.notes == [f"{ended / results.RUNS} {what}: runs that are in no part are carried out again"]
+    assert resumed.notes == [
+        f"{ended / results.RUNS} {what}: runs that are in no part are carried out again"
+    ]
     assert_same(ended, whole)
 
 
-def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(ended, half, whole):
+def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(
+    ended, half, whole
+):
     name = results.part_name(8, results.RUNS)
     (ended / results.PARTS).mkdir()
     shutil.copy(half / name, ended / name)
@@ -264,10 +294,16 @@ def test_no_bit_of_a_folder_can_change_in_silence(ended, whole):
     ("name", "damage", "note"),
     [
         (results.MANIFEST, lambda path: path.unlink(), "is missing: it is written anew"),
-        (results.FAILURES, lambda path: path.write_bytes(b""), "is empty: it is written anew, without traces"),
+        (
+            results.FAILURES,
+            lambda path: path.write_bytes(b""),
+            "is empty: it is written anew, without traces",
+        ),
     ],
 )
-def test_what_is_lost_beside_whole_tables_is_written_anew_without_a_run(ended, whole, name, damage, note):
+def test_what_is_lost_beside_whole_tables_is_written_anew_without_a_run(
+    ended, whole, name, damage, note
+):
     damage(ended / name)
     (finding,) = examine(ended).findings
     assert finding.name == name
@@ -276,9 +312,15 @@ def test_what_is_lost_beside_whole_tables_is_written_anew_without_a_run(ended, w
     assert_same(ended, whole)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b'{"schema_version": "4", "run_count": "many"}'])
-def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for(begun, whole, content):
-    (begun / results.MANIFEST).unlink() if content is None else (begun / results.MANIFEST).write_bytes(content)
+@pytest.mark.parametrize(
+    "content", [None, b"", b"{", b"[1]", b'{"schema_version": "4", "run_count": "many"}']
+)
+def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for(
+    begun, whole, content
+):
+    (begun / results.MANIFEST).unlink() if content is None else (
+        begun / results.MANIFEST
+    ).write_bytes(content)
     with pytest.raises(ConfigurationError, match=r"manifest\.json"):
         results.load_runs(begun)
     assert [finding.name for finding in examine(begun).findings] == [results.MANIFEST]
@@ -298,7 +340,9 @@ def test_a_batch_whose_checksums_are_lost_in_their_file_is_carried_out_again(bas
     assert_same(folder, whole)
 
 
-def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(begun, whole):
+def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(
+    begun, whole
+):
     (begun / results.MANIFEST).unlink()
     flip(begun / results.part_name(8, results.RUNS))
     assert run(begun, resume=True).repeated == 16
@@ -323,7 +367,10 @@ def test_a_manifest_of_wrong_types_is_one_line(ended, key, value, wanted):
     (ended / results.MANIFEST).write_text(json.dumps(manifest))
     for command in (results.load_runs, results.collect):
         shown = re.escape(repr(str(value)[:60]))
-        with pytest.raises(ConfigurationError, match=f"manifest.json is damaged: {key} must be {wanted}, got {shown};"):
+        with pytest.raises(
+            ConfigurationError,
+            match=f"manifest.json is damaged: {key} must be {wanted}, got {shown};",
+        ):
             command(ended)
 
 
@@ -340,7 +387,10 @@ def test_stray_files_are_named_and_count_for_nothing(begun, whole):
 
 
 def test_files_that_a_killed_process_had_begun_are_removed(begun, whole):
-    partial = [begun / f".{results.RUNS}-12-34", begun / results.PARTS / f".00000016.{results.RUNS}-12-34"]
+    partial = [
+        begun / f".{results.RUNS}-12-34",
+        begun / results.PARTS / f".00000016.{results.RUNS}-12-34",
+    ]
     for path in partial:
         path.write_bytes(b"half")
     assert examine(begun).findings == []
@@ -391,10 +441,14 @@ def test_rows_that_the_part_before_has_too_are_named_where_nothing_vouches_for_t
         (begun / results.part_name(index, results.RUNS)).unlink(missing_ok=True)
         tables.write_table(rows, begun / results.part_name(index, results.RUNS))
     named = {each.name: each.fault for each in examine(begun).findings}
-    assert named[results.part_name(12, results.RUNS)] == "holds runs that the part before it has, too"
+    assert (
+        named[results.part_name(12, results.RUNS)] == "holds runs that the part before it has, too"
+    )
 
 
-def test_a_changed_bit_is_found_by_the_pages_where_nothing_else_vouches_also_in_some_of_the_runs(tmp_path):
+def test_a_changed_bit_is_found_by_the_pages_where_nothing_else_vouches_also_in_some_of_the_runs(
+    tmp_path,
+):
     folder = tmp_path / "out"
     run(folder, seeds=range(2), steps=True)
     (folder / SUMS).unlink()
@@ -403,7 +457,9 @@ def test_a_changed_bit_is_found_by_the_pages_where_nothing_else_vouches_also_in_
         content = bytearray((folder / name).read_bytes())
         file = pq.ParquetFile(folder / name)
         chunk = file.metadata.row_group(0).column(file.schema_arrow.get_field_index(column))
-        content[chunk.data_page_offset + chunk.total_compressed_size - 1] ^= 1  # the last byte of its last page
+        content[chunk.data_page_offset + chunk.total_compressed_size - 1] ^= (
+            1  # the last byte of its last page
+        )
         (folder / name).write_bytes(content)
     for runs in (None, ids[:1]):
         with pytest.raises(DamagedFile, match=r"steps\.parquet cannot be read \(.*CRC"):
@@ -416,7 +472,9 @@ def test_a_manifest_of_another_schema_is_not_written_anew(begun):
     manifest = json.loads((begun / results.MANIFEST).read_text()) | {"schema_version": "3"}
     (begun / SUMS).unlink()
     (begun / results.MANIFEST).write_text(json.dumps(manifest))
-    with pytest.raises(ConfigurationError, match="has results of schema '3'; this servobench reads '4'; the column"):
+    with pytest.raises(
+        ConfigurationError, match="has results of schema '3'; this servobench reads '4'; the column"
+    ):
         run(begun, resume=True)
 
 

@@ -48,7 +48,9 @@ def test_a_signal_that_a_destructor_drops_ends_the_command(name, waits, capsys):
 
 
 def test_signals_that_were_ignored_on_entry_stay_ignored_but_ctrl_c():
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGHUP, signal.SIGINT)}
+    before = {
+        number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGHUP, signal.SIGINT)
+    }
     try:
         with ending_alike() as caught:
             signal.raise_signal(signal.SIGHUP)
@@ -62,10 +64,14 @@ def test_signals_that_were_ignored_on_entry_stay_ignored_but_ctrl_c():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
-def test_a_command_that_is_terminated_leaves_no_temporary_file_and_nothing_that_looks_whole(name, tmp_path):
+def test_a_command_that_is_terminated_leaves_no_temporary_file_and_nothing_that_looks_whole(
+    name, tmp_path
+):
     folder = comparison(tmp_path / "folder", tuple(f"c{k}" for k in range(150)), ("exp1",))
     (tmp_path / "temporary").mkdir()
-    process = start("export", str(folder), "--out", str(tmp_path / "csv"), TMPDIR=str(tmp_path / "temporary"))
+    process = start(
+        "export", str(folder), "--out", str(tmp_path / "csv"), TMPDIR=str(tmp_path / "temporary")
+    )
     wait_for(lambda: any(tmp_path.glob("*csv*")) or process.poll() is not None)
     os.kill(process.pid, signal.Signals[name])
     code, output = finish(process)

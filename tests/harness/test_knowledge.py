@@ -39,12 +39,16 @@ def test_the_cache_trains_once_for_each_configuration_and_model(trainings):
     first, second = obtain(), obtain()
     assert len(trainings) == 1
     np.testing.assert_array_equal(first.controller.weights, second.controller.weights)
-    np.testing.assert_array_equal(first.jacobian.weights, train(TRAINING, planar_jacobian, SPEC).jacobian.weights)
+    np.testing.assert_array_equal(
+        first.jacobian.weights, train(TRAINING, planar_jacobian, SPEC).jacobian.weights
+    )
     obtain(1.1)
     assert len(trainings) == 2
 
 
-@pytest.mark.parametrize("damage", [lambda content: content[: len(content) // 2], lambda content: b"", bytes.swapcase])
+@pytest.mark.parametrize(
+    "damage", [lambda content: content[: len(content) // 2], lambda content: b"", bytes.swapcase]
+)
 def test_a_damaged_file_is_trained_again_and_blocks_nobody(damage, trainings):
     first = obtain()
     (file,) = cache_folder(NETWORKS).rglob("*.npz")

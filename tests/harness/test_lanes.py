@@ -14,7 +14,10 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import FilterDiverged
 
-ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}}, "random": {"duration": 2.5}}
+ROUGH = {
+    "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}},
+    "random": {"duration": 2.5},
+}
 
 
 def lossy(probability, periods):
@@ -26,14 +29,19 @@ SEEDS = (40001, 40002, 40003, 40004, 40005)
 
 
 def runs(controller, settings, plant="kinematic", mismatch="severe", task="random"):
-    return [resolve(RunRequest(plant, controller, task, mismatch, seed), Settings(settings)) for seed in SEEDS]
+    return [
+        resolve(RunRequest(plant, controller, task, mismatch, seed), Settings(settings))
+        for seed in SEEDS
+    ]
 
 
 SIDE_BY_SIDE = [name for name in METHODS if METHODS[name].side_by_side]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", some(SIDE_BY_SIDE, "regression_mfac", "ukf_mpc", "rbf_pid:published", "rls"))
+@pytest.mark.parametrize(
+    "controller", some(SIDE_BY_SIDE, "regression_mfac", "ukf_mpc", "rbf_pid:published", "rls")
+)
 def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     together = runs(controller, ROUGH, mismatch="severe+camera_move=60deg")
     assert side_by_side_key(together[0]) is not None
@@ -43,26 +51,35 @@ def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     times = [found[0].row[name] for name in found[0].row.keys() - rows(found)[0].keys()]
     assert np.isnan(times).all()  # of a run among others they are unknown
     assert times
-    np.testing.assert_equal(rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]])
+    np.testing.assert_equal(
+        rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]]
+    )
 
 
 def test_runs_with_a_disturbed_sensor_go_side_by_side_but_not_with_others():
     words = "moderate+stable=1.3+outliers=20%+occlusions=10%+jitter=80ms"
     together = runs("ukf_mfac:published", {"random": {"duration": 2.5}}, mismatch=words)
     assert together[0].plant.sensing.outliers == 0.2
-    assert side_by_side_key(together[0]) != side_by_side_key(runs("ukf_mfac:published", {}, mismatch="moderate")[0])
+    assert side_by_side_key(together[0]) != side_by_side_key(
+        runs("ukf_mfac:published", {}, mismatch="moderate")[0]
+    )
     alone = assert_rows_of_single_runs(together)
-    assert len({row["valid_share"] if "valid_share" in row else row["rms_error"] for row in alone}) == len(SEEDS)
+    assert len(
+        {row["valid_share"] if "valid_share" in row else row["rms_error"] for row in alone}
+    ) == len(SEEDS)
 
 
 @pytest.mark.parametrize(
-    ("settings", "ends"), [(lossy(0.7, 9), {"completed", "feature_lost"}), (lossy(0.99, 3), {"feature_lost"})]
+    ("settings", "ends"),
+    [(lossy(0.7, 9), {"completed", "feature_lost"}), (lossy(0.99, 3), {"feature_lost"})],
 )
 def test_runs_that_lose_the_feature_leave_the_others_alone_and_have_their_rows(settings, ends):
     assert {row["status"] for row in assert_rows_of_single_runs(runs("ukf_mfac", settings))} == ends
 
 
-@pytest.mark.parametrize("kind", [FilterDiverged, FloatingPointError, np.linalg.LinAlgError, KeyError])
+@pytest.mark.parametrize(
+    "kind", [FilterDiverged, FloatingPointError, np.linalg.LinAlgError, KeyError]
+)
 def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkeypatch):
     command = MfacLaw.command
 

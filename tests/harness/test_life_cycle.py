@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from kit.plants import configure, mismatched
 from servobench.harness.config.registry import find_plant
@@ -22,7 +28,13 @@ MODELS = [mismatched("severe+gear_ratio=5%", seed) for seed in range(LANES)]
 STARTS = np.array(HOME) + np.random.default_rng(0).uniform(-0.3, 0.3, (LANES, 6))
 MAX_PERIODS = 200
 COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (MAX_PERIODS, LANES, 6))
-SENSING = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3, "outliers": 0.2}
+SENSING = {
+    "command_delay": 0.13,
+    "latency": 0.07,
+    "frame_period": 0.03,
+    "drop_probability": 0.3,
+    "outliers": 0.2,
+}
 FEW = settings(max_examples=4, stateful_step_count=25, deadline=None)
 
 
@@ -58,7 +70,9 @@ class PlantLife(RuleBasedStateMachine):
         self.k = k
         truth = self.plant.truth()
         for place, lane in enumerate(self.lanes.tolist()):
-            shown = bits(observation.joint_position[place], observation.feature[place], truth.feature[place])
+            shown = bits(
+                observation.joint_position[place], observation.feature[place], truth.feature[place]
+            )
             assert self.seen.setdefault((lane, self.seed, k), shown) == shown
 
     @rule()
@@ -74,9 +88,12 @@ class PlantLife(RuleBasedStateMachine):
     @precondition(lambda self: len(self.lanes) > 1)
     @rule(data=st.data())
     def keep(self, data) -> None:
-        chosen = np.array(sorted(data.draw(st.sets(st.integers(0, len(self.lanes) - 1), min_size=1))))
+        chosen = np.array(
+            sorted(data.draw(st.sets(st.integers(0, len(self.lanes) - 1), min_size=1)))
+        )
         self.plant.keep(chosen)
-        self.lanes, self.saved = self.lanes[chosen], []  # states of more runs are no states of these
+        # States of more runs are no states of these
+        self.lanes, self.saved = (self.lanes[chosen], [])
 
     @rule()
     def close_and_build(self) -> None:

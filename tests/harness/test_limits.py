@@ -13,19 +13,36 @@ from servobench.controllers.methods import METHODS
 from servobench.harness.batch import blocks, processes
 from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.container import memory_limit, processor_limit
-from servobench.harness.batch.processes import FOREIGN_TIME, LEAST_FOREIGN_MEMORY, Bounds, Limits, read_size, show_size
+from servobench.harness.batch.processes import (
+    FOREIGN_TIME,
+    LEAST_FOREIGN_MEMORY,
+    Bounds,
+    Limits,
+    read_size,
+    show_size,
+)
 from servobench.harness.config.registry import is_foreign_controller, is_foreign_plant
 
 
 @pytest.mark.parametrize(
     ("text", "size"),
-    [("2GB", 2e9), ("500 MB", 5e8), ("1.5gb", 1.5e9), ("64kB", 64e3), ("1TB", 1e12), ("100B", 100), ("inf", math.inf)],
+    [
+        ("2GB", 2e9),
+        ("500 MB", 5e8),
+        ("1.5gb", 1.5e9),
+        ("64kB", 64e3),
+        ("1TB", 1e12),
+        ("100B", 100),
+        ("inf", math.inf),
+    ],
 )
 def test_sizes_are_read_as_they_are_written(text, size):
     assert read_size(text) == size
 
 
-@pytest.mark.parametrize(("size", "text"), [(2e9, "2 GB"), (6.5e8, "650 MB"), (64e3, "64 kB"), (100, "100 B")])
+@pytest.mark.parametrize(
+    ("size", "text"), [(2e9, "2 GB"), (6.5e8, "650 MB"), (64e3, "64 kB"), (100, "100 B")]
+)
 def test_sizes_are_shown_in_their_largest_unit(size, text):
     assert show_size(int(size)) == text
 
@@ -75,7 +92,9 @@ def test_only_foreign_code_has_limits_that_nobody_gave():
         ({}, math.inf, math.inf),
     ],
 )  # fmt: skip
-def test_limits_of_a_container_are_those_of_its_group_and_of_the_groups_around_it(files, memory, processors, tmp_path):
+def test_limits_of_a_container_are_those_of_its_group_and_of_the_groups_around_it(
+    files, memory, processors, tmp_path
+):
     for name, text in files.items():
         path = tmp_path / (name if name.startswith("proc") else f"sys/fs/cgroup/{name}")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -94,7 +113,9 @@ def test_limits_of_a_container_are_those_of_its_group_and_of_the_groups_around_i
         (32e9, 2e9, 2, 0.8e9),
     ],
 )
-def test_foreign_code_gets_a_share_of_the_memory_that_is_there(machine, container, workers, wanted, monkeypatch):
+def test_foreign_code_gets_a_share_of_the_memory_that_is_there(
+    machine, container, workers, wanted, monkeypatch
+):
     total = psutil.virtual_memory()._replace(total=machine)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: total)
     monkeypatch.setattr(processes, "memory_limit", lambda: container)
@@ -120,9 +141,13 @@ def test_a_system_that_hides_processes_is_named_where_there_are_limits(monkeypat
     monkeypatch.setattr(blocks, "remark", said.append)
     monkeypatch.setattr(processes, "_ask", lambda *_: None)
     for limit in (math.inf, 1e9):
-        with open_workers(1, bounds=Bounds(run_memory=limit), plants=("kinematic",), controllers=("constant",)):
+        with open_workers(
+            1, bounds=Bounds(run_memory=limit), plants=("kinematic",), controllers=("constant",)
+        ):
             pass
-    assert [line.partition(",")[0] for line in said] == ["the memory and the processes of a run cannot be watched here"]
+    assert [line.partition(",")[0] for line in said] == [
+        "the memory and the processes of a run cannot be watched here"
+    ]
 
 
 def test_methods_of_this_package_are_not_foreign_and_everything_else_is():
@@ -164,7 +189,9 @@ time.sleep(60)
 def test_processes_below_one_are_found_with_their_memory(listed, monkeypatch):
     if not listed:  # as gVisor's kernel
         monkeypatch.setattr(processes, "_lists_children", lambda: False)
-    with subprocess.Popen([sys.executable, "-S", "-c", FAMILY], stdout=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-S", "-c", FAMILY], stdout=subprocess.PIPE, text=True
+    ) as parent:
         child = int(parent.stdout.readline())
         try:
             assert child in processes.descendants(os.getpid())

@@ -27,7 +27,9 @@ def test_lists_fit_into_80_columns_and_no_name_is_broken(output_of, kind):
     text = output_of(kind)
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
-    listed = [line.split()[0] for line in text.split("\n\n")[0].splitlines() if not line.startswith(" ")]
+    listed = [
+        line.split()[0] for line in text.split("\n\n")[0].splitlines() if not line.startswith(" ")
+    ]
     assert listed == [each["name"] for each in json.loads(output_of(kind, "--json"))]
 
 
@@ -40,12 +42,17 @@ def test_all_names_and_summaries_are_there_as_json(output_of):
 
 def test_settings_are_explained_to_readers_and_programs(output_of):
     found = json.loads(output_of("plants", "kinematic", "--json"))
-    wanted = json.loads(json.dumps({f"kinematic.{key}": value for key, value in flatten(ENTRY.config()).items()}))
+    wanted = json.loads(
+        json.dumps({f"kinematic.{key}": value for key, value in flatten(ENTRY.config()).items()})
+    )
     assert {each["setting"]: each["default"] for each in found} == wanted
     lag = next(each for each in found if each["setting"] == "kinematic.lag")
     assert (lag["unit"], lag["allowed"]) == ("s", "≥ 0")
     text = output_of("plants", "kinematic")
-    assert "kinematic.lag = 0.05\n    [s] τ, time constant of the joints' velocity loops; 0 means none (≥ 0)" in text
+    assert (
+        "kinematic.lag = 0.05\n    [s] τ, time constant of the joints' velocity loops; 0 means none (≥ 0)"
+        in text
+    )
 
 
 def test_values_that_json_has_no_word_for_are_text():
@@ -59,7 +66,9 @@ def completed(*words):
         command = command.commands[word]
     named = words[-2] if words[-2].startswith("-") else None
     options = (
-        each for each in command.params if named in each.opts or (not named and each.param_type_name == "argument")
+        each
+        for each in command.params
+        if named in each.opts or (not named and each.param_type_name == "argument")
     )
     context = command.make_context("x", [], resilient_parsing=True)
     return [item.value for item in next(options).shell_complete(context, incomplete)]
@@ -92,14 +101,28 @@ def test_the_shell_completes_names_also_within_lists(words, wanted):
     ("words", "joined", "before"),
     [
         (["servobench", "run", "ukf"], ["servobench", "run", "ukf"], ""),
-        (["servobench", "run", "ukf_mfac", ":", "pub"], ["servobench", "run", "ukf_mfac:pub"], "ukf_mfac:"),
+        (
+            ["servobench", "run", "ukf_mfac", ":", "pub"],
+            ["servobench", "run", "ukf_mfac:pub"],
+            "ukf_mfac:",
+        ),
         (["servobench", "run", "ukf_mfac", ":"], ["servobench", "run", "ukf_mfac:"], "ukf_mfac:"),
-        (["servobench", "run", "--plant", "=", "kin"], ["servobench", "run", "--plant=kin"], "--plant="),
-        (["servobench", "run", "a", "=", "./b.py", ":", "M"], ["servobench", "run", "a=./b.py:M"], "a=./b.py:"),
+        (
+            ["servobench", "run", "--plant", "=", "kin"],
+            ["servobench", "run", "--plant=kin"],
+            "--plant=",
+        ),
+        (
+            ["servobench", "run", "a", "=", "./b.py", ":", "M"],
+            ["servobench", "run", "a=./b.py:M"],
+            "a=./b.py:",
+        ),
         (["servobench", "run", "a", ":", "b", ""], ["servobench", "run", "a:b", ""], ""),
     ],
 )
-def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_were_typed(words, joined, before):
+def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_were_typed(
+    words, joined, before
+):
     assert join_words([*words, "after"], len(words) - 1) == (joined, before)
 
 

@@ -46,7 +46,10 @@ def other_process(folder):
 def test_the_second_process_learns_who_holds_the_folder_and_a_killed_one_holds_it_no_more(tmp_path):
     out = tmp_path / "out"
     with other_process(out) as process:
-        with pytest.raises(ConfigurationError, match="is being written by process") as refused, locked(out):
+        with (
+            pytest.raises(ConfigurationError, match="is being written by process") as refused,
+            locked(out),
+        ):
             pass
         words = str(refused.value)
         assert f"process {process.pid} of " in words
@@ -64,12 +67,17 @@ def test_a_lock_that_is_given_back_leaves_nothing_and_can_be_taken_again(tmp_pat
     for _ in range(3):
         with locked(tmp_path / "out") as lock:
             assert lock.stale is None
-            with pytest.raises(ConfigurationError, match=f"process {os.getpid()} of"), locked(tmp_path / "out"):
+            with (
+                pytest.raises(ConfigurationError, match=f"process {os.getpid()} of"),
+                locked(tmp_path / "out"),
+            ):
                 pass
         assert list((tmp_path / "out").iterdir()) == []
 
 
-@pytest.mark.parametrize("names", [[], [LOCK], [".manifest.json-12-3"], ["parts/"], ["parts/.part-0.parquet-12-3"]])
+@pytest.mark.parametrize(
+    "names", [[], [LOCK], [".manifest.json-12-3"], ["parts/"], ["parts/.part-0.parquet-12-3"]]
+)
 def test_a_folder_of_a_batch_that_was_killed_before_its_first_run_is_unused(tmp_path, names):
     for name in names:
         path = tmp_path / name
@@ -106,7 +114,9 @@ def test_a_process_with_the_number_of_one_that_ended_is_another_one():
     assert not holder(pid=2**22 + 1, host="elsewhere").gone
 
 
-def test_a_lock_left_by_another_machine_is_free_for_the_system_s_locks_reach_all_that_share_the_folder(tmp_path):
+def test_a_lock_left_by_another_machine_is_free_for_the_system_s_locks_reach_all_that_share_the_folder(
+    tmp_path,
+):
     (tmp_path / LOCK).write_text(json.dumps(asdict(holder(host="elsewhere", pid=7))))
     with locked(tmp_path) as lock:
         assert lock.stale.host == "elsewhere"

@@ -9,14 +9,18 @@ from servobench.harness.run.metrics import judge_run, overshoot, settling_time, 
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, column_unit
 
 PERIOD = 0.1
-SPEC = PlantSpec.of_joints(("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0)
+SPEC = PlantSpec.of_joints(
+    ("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0
+)
 X = (0.0, 0.5, 1.0, 1.0)
 VELOCITY = (2.0, -2.0, 1.0, 0.0)  # of joint a; its limit is 2
 CONDITION = (1.0, 3.0, 2.0, 1.0)
 ESTIMATE = (1.2, 1.4, None, None)  # times the true Jacobian
 
 
-def straight_move(diagnostics=({}, {}, {}, {}), periods=4, milliseconds=(0.001, 0.002, 0.003, 0.004)):
+def straight_move(
+    diagnostics=({}, {}, {}, {}), periods=4, milliseconds=(0.001, 0.002, 0.003, 0.004)
+):
     """Return the log of so many periods; the fourth has no valid feature. A step of the controller takes so long."""
     log = StepLog(SPEC, 4)
     for k in range(periods):
@@ -35,7 +39,10 @@ def straight_move(diagnostics=({}, {}, {}, {}), periods=4, milliseconds=(0.001, 
 @pytest.mark.parametrize(
     ("error", "wanted"),
     [
-        ([1.0, 0.001, 0.1, *[0.001] * 10], PERIOD * (2.0 + 0.095 / 0.099)),  # left again, back between two
+        (
+            [1.0, 0.001, 0.1, *[0.001] * 10],
+            PERIOD * (2.0 + 0.095 / 0.099),
+        ),  # left again, back between two
         ([0.005] * 20, 0.0),  # on the edge from the start
         ([1.0] * 10 + [0.0] * 5, 0.9995),
         ([1.0] * 10 + [0.0] * 4, np.nan),  # too late
@@ -70,9 +77,13 @@ def test_settling_and_overshoot_agree_with_python_control():
     times = np.arange(0.0, 15.0, 0.01)
     _, response = control.step_response(system, times)
     info = control.step_info(response, times, SettlingTimeThreshold=0.05, yfinal=1.0)
-    assert settling_time(np.abs(1.0 - response), 0.05, 0.01) == pytest.approx(info["SettlingTime"] - 0.005, abs=0.0051)
+    assert settling_time(np.abs(1.0 - response), 0.05, 0.01) == pytest.approx(
+        info["SettlingTime"] - 0.005, abs=0.0051
+    )
     track = np.outer(response, [0.3, 0.0, -0.4])
-    assert overshoot(track.T, np.array([0.3, 0.0, -0.4])) == pytest.approx(info["Overshoot"] / 100, abs=1e-9)
+    assert overshoot(track.T, np.array([0.3, 0.0, -0.4])) == pytest.approx(
+        info["Overshoot"] / 100, abs=1e-9
+    )
 
 
 def test_no_overshoot_when_the_feature_stops_short():
@@ -116,7 +127,12 @@ def test_where_one_time_is_unknown_no_overruns_are_counted():
 COLUMNS = [
     *("run_id", "step", "time_s", "reference_x_m", "reference_y_m", "feature_x_m", "feature_y_m"),
     *("true_feature_x_m", "true_feature_y_m", "joint_position_a_rad", "joint_position_b_rad"),
-    *("joint_velocity_command_a_rad_s", "joint_velocity_command_b_rad_s", "error_norm", "jacobian_error"),
+    *(
+        "joint_velocity_command_a_rad_s",
+        "joint_velocity_command_b_rad_s",
+        "error_norm",
+        "jacobian_error",
+    ),
     *("jacobian_condition", "feature_valid", "controller_time_us", "plant_time_us"),
 ]
 
@@ -135,7 +151,9 @@ def test_a_table_holds_what_was_logged_under_names_with_units():
 
 
 def test_a_diagnostic_that_comes_late_is_unknown_before():
-    log = straight_move(({"probing": 1.0}, {"probing": 1.0}, {"probing": 0.0, "noise": 0.5}, {"noise": 0.25}))
+    log = straight_move(
+        ({"probing": 1.0}, {"probing": 1.0}, {"probing": 0.0, "noise": 0.5}, {"noise": 0.25})
+    )
     table = log.steps().table("one")
     assert list(table)[len(COLUMNS) :] == ["diagnostic_probing", "diagnostic_noise"]
     np.testing.assert_array_equal(table["diagnostic_probing"], [1.0, 1.0, 0.0, np.nan])
@@ -159,6 +177,8 @@ def test_a_singular_jacobian_has_an_infinite_condition():
     assert log.steps().jacobian_condition()[1] == np.inf
 
 
-@pytest.mark.parametrize(("unit", "suffix"), [("m", "m"), ("rad/s", "rad_s"), ("px", "px"), ("m/s^2", "m_s_2")])
+@pytest.mark.parametrize(
+    ("unit", "suffix"), [("m", "m"), ("rad/s", "rad_s"), ("px", "px"), ("m/s^2", "m_s_2")]
+)
 def test_units_become_suffixes_of_columns(unit, suffix):
     assert column_unit(unit) == suffix

@@ -69,7 +69,9 @@ def switches(command, limit):
 def overshoot(feature, target):
     way = [t - f for t, f in zip(target, feature[0], strict=True)]
     length = sum(w * w for w in way)
-    passed = max(sum(w * (y - y0) for w, y, y0 in zip(way, row, feature[0], strict=True)) for row in feature)
+    passed = max(
+        sum(w * (y - y0) for w, y, y0 in zip(way, row, feature[0], strict=True)) for row in feature
+    )
     return max(0.0, passed / length - 1.0)
 
 
@@ -79,7 +81,9 @@ def by_definition(steps, kind):
     error = [distance(a, b) for a, b in zip(r, y, strict=True)]
     times = [k * PERIOD for k in range(len(error))]
     acceleration = [[(b - a) / PERIOD for a, b in zip(*pair, strict=True)] for pair in pairwise(u)]
-    jerk = [[(b - a) / PERIOD for a, b in zip(*pair, strict=True)] for pair in pairwise(acceleration)]
+    jerk = [
+        [(b - a) / PERIOD for a, b in zip(*pair, strict=True)] for pair in pairwise(acceleration)
+    ]
     way = distance(r[0], y[0]) if kind == "point_to_point" else sum(map(distance, r, r[1:]))
     deviations = [
         np.linalg.norm(a - b) / np.linalg.norm(b)
@@ -123,14 +127,23 @@ def by_definition(steps, kind):
 @pytest.mark.parametrize("seed", range(5))
 def test_every_metric_is_its_definition(seed, kind, calm):
     steps = random_log(seed, calm=calm)
-    assert judge_run(steps, kind, EVALUATED, LAP) == pytest.approx(by_definition(steps, kind), rel=1e-12, nan_ok=True)
+    assert judge_run(steps, kind, EVALUATED, LAP) == pytest.approx(
+        by_definition(steps, kind), rel=1e-12, nan_ok=True
+    )
 
 
 def test_the_logs_above_reach_every_branch():
-    calm, rough = (by_definition(random_log(0, calm=calm), "point_to_point") for calm in (True, False))
+    calm, rough = (
+        by_definition(random_log(0, calm=calm), "point_to_point") for calm in (True, False)
+    )
     assert math.isfinite(calm["settling_time_5pct_s"])
     assert math.isnan(rough["settling_time_s"])
-    for name in ("saturation_fraction", "command_switches", "controller_time_overruns", "overshoot"):
+    for name in (
+        "saturation_fraction",
+        "command_switches",
+        "controller_time_overruns",
+        "overshoot",
+    ):
         assert rough[name] > 0.0
 
 
@@ -140,7 +153,9 @@ def test_runs_side_by_side_are_judged_as_single_ones():
              "estimated_jacobian", "true_jacobian")  # fmt: skip
     unknown = np.full(40, np.nan)
     lanes = {name: np.stack([getattr(log, name) for log in logs], axis=1) for name in names}
-    steps = Steps(SPEC, logs[0].time, **lanes, controller_time=unknown, plant_time=unknown, diagnostics={})
+    steps = Steps(
+        SPEC, logs[0].time, **lanes, controller_time=unknown, plant_time=unknown, diagnostics={}
+    )
     found = judge_run(steps, "curve", EVALUATED, LAP)
     for lane, log in enumerate(logs):
         alone = judge_run(log, "curve", EVALUATED, LAP)

@@ -70,12 +70,16 @@ def test_a_study_is_not_continued_with_another_version_of_a_module_of_its_plant(
         open_ledger(Path(), "rls", runs).add({}, [1.0])
         assert open_ledger(Path(), "rls", runs).costs({}) == [1.0]
         write({"gear.py": "RATIO = 0.5"})
-        with pytest.raises(ConfigurationError, match=r"^study rls.jsonl was made with other plants"):
+        with pytest.raises(
+            ConfigurationError, match=r"^study rls.jsonl was made with other plants"
+        ):
             open_ledger(Path(), "rls", runs)
 
 
 def test_an_fmu_is_looked_at_also_where_a_mapping_names_it():
-    write({"cell/crane.toml": 'file = "../lib/crane.fmu"\n', "lib/crane.fmu": "1", "pilot.fmu": "2"})
+    write(
+        {"cell/crane.toml": 'file = "../lib/crane.fmu"\n', "lib/crane.fmu": "1", "pilot.fmu": "2"}
+    )
     names = {"fmu:cell/crane.toml": None}, {"fmu:pilot.fmu": None, "constant": None}
     found = named_files(Survey(plants=names[0], controllers=names[1]), {}, ())
     assert list(found) == ["cell/crane.toml", "cell/../lib/crane.fmu", "pilot.fmu"]

@@ -73,7 +73,14 @@ def test_a_robot_without_a_file_is_read_by_its_marks(text, parts):
 def test_a_list_has_files_with_commas_in_their_paths():
     for name in ("a,b/law.py", "c,d,e.FMU", "f,1.yaml", "g,h/side.py"):
         write(name)
-    words = ["a,b/law.py:Law", "x=a,b/law.py", "fmu:c,d,e.FMU", "factory=f,1.yaml", "g,h/side.py:hand", "mfac+rls"]
+    words = [
+        "a,b/law.py:Law",
+        "x=a,b/law.py",
+        "fmu:c,d,e.FMU",
+        "factory=f,1.yaml",
+        "g,h/side.py:hand",
+        "mfac+rls",
+    ]
     assert split_words(" , ".join(words)) == tuple(words)
     assert split_words("no,b/law.py,,x ,") == ("no", "b/law.py", "x")
     assert split_words("c,a,b", known=("a,b",)) == ("c", "a,b")
@@ -94,9 +101,14 @@ def test_other_files_are_found_under_any_name():
     assert find_challenge("x,1.TOML").title == find_challenge("severe").title
     calibration = write("a+b=c.yaml")
     mismatch = Mismatch.parse(f"factory={calibration}+gear_ratio=5%")
-    assert (mismatch.calibration, str(mismatch)) == ("a+b=c.yaml", "factory=a+b=c.yaml+gear_ratio=5%")
+    assert (mismatch.calibration, str(mismatch)) == (
+        "a+b=c.yaml",
+        "factory=a+b=c.yaml+gear_ratio=5%",
+    )
     write("1#2.csv")
-    settings = read_settings(None, ["waypoints.file=1#2.csv", "exp1.duration=4 # s", "fmu:a=b.TOML.lag=0.1"])
+    settings = read_settings(
+        None, ["waypoints.file=1#2.csv", "exp1.duration=4 # s", "fmu:a=b.TOML.lag=0.1"]
+    )
     assert settings.sections["waypoints"]["file"] == "1#2.csv"
     assert settings.sections["exp1"]["duration"] == 4
     assert settings.sections["fmu:a=b.TOML"]["lag"] == 0.1
@@ -105,13 +117,32 @@ def test_other_files_are_found_under_any_name():
 def test_an_fmu_has_the_name_that_a_user_gives_it(output_of):
     pilot = exported("rbf_pid:published", 2)
     write("pilot,1.FMU").write_bytes(pilot.read_bytes())
-    short = "--set", "exp1.duration=0.2", "--no-figures", "--no-report", "--workers", "2", "--out", "runs"
+    short = (
+        "--set",
+        "exp1.duration=0.2",
+        "--no-figures",
+        "--no-report",
+        "--workers",
+        "2",
+        "--out",
+        "runs",
+    )
     output_of(
-        "compare", "--controllers", "mine=pilot,1.FMU,rbf_pid:published", "--tasks", "exp1", "--seeds", "2", *short
+        "compare",
+        "--controllers",
+        "mine=pilot,1.FMU,rbf_pid:published",
+        "--tasks",
+        "exp1",
+        "--seeds",
+        "2",
+        *short,
     )
     runs = results.load_runs(Path("runs"))
     assert runs["controller"].tolist() == ["mine", "mine", "rbf_pid:published", "rbf_pid:published"]
-    own, original = (runs[runs["controller"] == name]["rms_error"].tolist() for name in ("mine", "rbf_pid:published"))
+    own, original = (
+        runs[runs["controller"] == name]["rms_error"].tolist()
+        for name in ("mine", "rbf_pid:published")
+    )
     assert own == pytest.approx(original, rel=1e-9)
     manifest = results.read_manifest(Path("runs"))
     assert manifest["own_controllers"]["mine"]["place"] == "fmu:pilot,1.FMU"
@@ -132,4 +163,6 @@ def test_a_mapped_plant_has_the_name_that_a_user_gives_it():
 
 def test_a_log_in_capitals_is_a_table():
     write("LOG.CSV", "time_s\n0.0\n0.05\n")
-    assert logged_in_file(Path("LOG.CSV"), "constant", "ur10e", "position")[1]["time_s"].tolist() == [0.0, 0.05]
+    assert logged_in_file(Path("LOG.CSV"), "constant", "ur10e", "position")[1][
+        "time_s"
+    ].tolist() == [0.0, 0.05]

@@ -16,7 +16,9 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import HOME
 
-SPEC = PlantSpec.of_joints(("a", "b"), ("x",), np.full(2, 2.0), np.full(2, -3.0), np.full(2, 3.0), period=0.1)
+SPEC = PlantSpec.of_joints(
+    ("a", "b"), ("x",), np.full(2, 2.0), np.full(2, -3.0), np.full(2, 3.0), period=0.1
+)
 STOP, FREE, FAR, NEAR = 3.0, 2.9, 1.0, 0.001
 REACHED, FAR_AWAY = nominal_ur5().feature(HOME), np.array([0.0, -1.5, 1.25])
 
@@ -46,7 +48,9 @@ def test_a_joint_rests_at_its_limit_after_a_second_outside_the_band(joints, erro
     assert joint_rests_at_limit(logged(joints, errors), 0.005) is rests
 
 
-def run(controller: str, task: str, settings: dict[str, object], seed: int = 3, mismatch: str = "none") -> ResolvedRun:
+def run(
+    controller: str, task: str, settings: dict[str, object], seed: int = 3, mismatch: str = "none"
+) -> ResolvedRun:
     return resolve(RunRequest("kinematic", controller, task, mismatch, seed), Settings(settings))
 
 
@@ -91,7 +95,9 @@ def test_a_target_out_of_reach_counts_before_a_joint_at_its_stop(target, at_stop
     assert find_outcome(log.steps(), scenario, np.nan, 0.17, robot) == outcome
 
 
-def test_outcomes_of_runs_side_by_side_are_those_of_each_alone_however_few_fit_into_memory(monkeypatch):
+def test_outcomes_of_runs_side_by_side_are_those_of_each_alone_however_few_fit_into_memory(
+    monkeypatch,
+):
     settings = {"random": {"duration": 1.0}}
     runs = [run("ukf_mfac", "random", settings, seed, "severe") for seed in range(40001, 40008)]
     alone = [carry_out(each, steps=False).row["outcome"] for each in runs]
@@ -107,7 +113,10 @@ def test_endurance_is_more_laps_of_the_same_curve():
     settings = {"endurance": {"laps": 3, "lap_time": 4.0, "curve": "lemniscate"}}
     row, two = (
         carry_out(run("calibrated", task, chosen), steps=False).row
-        for task, chosen in (("endurance", settings), ("lemniscate", {"lemniscate": {"laps": 2, "lap_time": 4.0}}))
+        for task, chosen in (
+            ("endurance", settings),
+            ("lemniscate", {"lemniscate": {"laps": 2, "lap_time": 4.0}}),
+        )
     )
     assert row["periods"] == 240
     assert row["rms_error_second_lap"] == two["rms_error_evaluated"] == two["rms_error_second_lap"]
@@ -117,6 +126,7 @@ def test_endurance_is_more_laps_of_the_same_curve():
 
 def test_the_stretched_arm_has_lost_a_direction_to_move_in():
     singular = np.linalg.svd(
-        nominal_ur5().arm.ball_and_jacobian(TASKS["singular_start"].default.start)[1], compute_uv=False
+        nominal_ur5().arm.ball_and_jacobian(TASKS["singular_start"].default.start)[1],
+        compute_uv=False,
     )
     assert singular[-1] < 1e-6 * singular[0]

@@ -9,7 +9,11 @@ import pytest
 from kit.folders import comparison, failed_only, made_up_row, sweep
 from servobench.controllers.aids import EQUIPPED
 from servobench.harness.analysis import tables
-from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
+from servobench.harness.analysis.folder import (
+    describe_controllers,
+    describe_folder,
+    describe_settings,
+)
 from servobench.harness.analysis.verdict import leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import FIGURES
@@ -17,7 +21,10 @@ from servobench.harness.run.metrics import METRICS
 
 
 def moves(*times: float, **values: object) -> pd.DataFrame:
-    rows = [made_up_row(str(seed), seed=seed, settling_time_s=time, **values) for seed, time in enumerate(times)]
+    rows = [
+        made_up_row(str(seed), seed=seed, settling_time_s=time, **values)
+        for seed, time in enumerate(times)
+    ]
     return pd.DataFrame(rows)
 
 
@@ -51,13 +58,24 @@ def test_moves_stand_apart_by_task_and_curves_beside_them(tmp_path):
 
 def test_no_table_holds_the_largest_error_of_a_move_which_is_its_start(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
-    every = [*tables.move_tables(runs).values(), *tables.curve_tables(runs).values(), tables.overview(runs)]
+    every = [
+        *tables.move_tables(runs).values(),
+        *tables.curve_tables(runs).values(),
+        tables.overview(runs),
+    ]
     assert not [name for table in every for name in table.columns if "largest error" in name[1]]
 
 
 def test_the_headings_of_a_notebook_are_two_rows_and_no_tuples(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
-    every = tables.overview, tables.cost_table, tables.runs_table, tables.outcome_table, tables.failure_table, leaders
+    every = (
+        tables.overview,
+        tables.cost_table,
+        tables.runs_table,
+        tables.outcome_table,
+        tables.failure_table,
+        leaders,
+    )
     for table in (make(runs) for make in every):
         assert table.empty or table.columns.nlevels == 2
         assert "(" not in table.iloc[:0].to_html(index=False)
@@ -74,14 +92,23 @@ def test_a_published_method_stands_below_its_method_and_others_keep_their_order(
 
 def test_only_conditions_that_vary_get_a_column(tmp_path):
     (table,) = tables.move_tables(results.load_runs(sweep(tmp_path / "out"))).values()
-    assert [heading for group, heading in table.columns if group == ""] == ["controller", "mismatch", "latency [ms]"]
+    assert [heading for group, heading in table.columns if group == ""] == [
+        "controller",
+        "mismatch",
+        "latency [ms]",
+    ]
     assert len(table) == 3 * 3 * 2
     assert set(table["", "latency [ms]"]) == {"0", "50"}
 
 
 def test_the_overview_has_a_group_for_each_task(tmp_path):
     table = tables.overview(results.load_runs(comparison(tmp_path / "out")))
-    assert list(dict.fromkeys(group for group, _ in table.columns)) == ["", "exp1", "exp2", "circle"]
+    assert list(dict.fromkeys(group for group, _ in table.columns)) == [
+        "",
+        "exp1",
+        "exp2",
+        "circle",
+    ]
     assert table["exp1", "settling time [s]"].tolist() == ["1.50"] * 3
     assert table["circle", "RMS error of the judged part [mm]"].tolist() == ["2.00"] * 3
 
@@ -94,7 +121,9 @@ def test_the_overview_of_many_conditions_is_one_group_a_task(tmp_path):
 
 def test_what_came_of_runs_is_told_where_not_all_went_well():
     words = ["settled", "settled", "target_unreachable", "crashed"]
-    mixed = pd.DataFrame([made_up_row(str(i), seed=i, outcome=word) for i, word in enumerate(words)])
+    mixed = pd.DataFrame(
+        [made_up_row(str(i), seed=i, outcome=word) for i, word in enumerate(words)]
+    )
     row = tables.outcome_table(pd.concat([mixed, moves(1.0, 1.0, task="exp2", outcome="settled")]))
     assert row["", "task"].tolist() == ["exp1"]
     assert row["As asked", "settled [%]"].tolist() == ["50 [15, 85]"]  # Wilson
@@ -116,7 +145,10 @@ def test_errors_are_in_the_unit_of_the_feature():
     assert table["Error", "error of the last second [rad]"].tolist() == ["0.00"]
     (both,) = tables.move_tables(pd.concat([moves(1.0), radians.assign(plant="crane")])).values()
     (metres,) = tables.move_tables(moves(1.0)).values()
-    own = [*metres["Error", "error of the last second [mm]"], *table["Error", "error of the last second [rad]"]]
+    own = [
+        *metres["Error", "error of the last second [mm]"],
+        *table["Error", "error of the last second [rad]"],
+    ]
     assert both["Error", "error of the last second [mm or rad]"].tolist() == own
 
 
@@ -127,7 +159,9 @@ def test_times_that_are_not_known_get_no_column():
 
 
 def test_a_run_tells_how_it_ended_and_what_came_of_it():
-    table = tables.runs_table(pd.DataFrame([made_up_row("a", outcome="joint_at_limit", settling_time_s=np.nan)]))
+    table = tables.runs_table(
+        pd.DataFrame([made_up_row("a", outcome="joint_at_limit", settling_time_s=np.nan)])
+    )
     assert table["How it ended"].iloc[0].tolist() == ["completed", "joint_at_limit"]
     assert table.iloc[0].tolist()[:3] == ["ukf_mfac", "exp1", "0"]
 
@@ -136,13 +170,21 @@ def test_a_run_tells_how_it_ended_and_what_came_of_it():
 def test_every_table_of_every_kind_of_folder_is_text_without_pythons_words(tmp_path, folder):
     path = folder(tmp_path / "out")
     runs = results.load_runs(path)
-    whole = (tables.overview, tables.outcome_table, tables.cost_table, tables.runs_table, tables.failure_table)
+    whole = (
+        tables.overview,
+        tables.outcome_table,
+        tables.cost_table,
+        tables.runs_table,
+        tables.failure_table,
+    )
     by_task = (tables.move_tables, tables.curve_tables)
     made = [make(runs) for make in whole] + [own for make in by_task for own in make(runs).values()]
     cells = [cell for table in made for cell in table.to_numpy().ravel()]
     assert cells
     assert all(isinstance(cell, str) for cell in cells)
-    assert not {"nan", "inf", "None", "NaN"} & {word.strip("[],") for cell in cells for word in cell.split()}
+    assert not {"nan", "inf", "None", "NaN"} & {
+        word.strip("[],") for cell in cells for word in cell.split()
+    }
     assert describe_folder(path, runs)["runs"].startswith(f"{len(runs)}, of which ")
 
 
@@ -161,9 +203,15 @@ def test_each_metric_is_shown_in_its_unit_with_its_digits():
     values = dict.fromkeys(METRICS, 1.2345678) | {"rms_error_second_lap": 2.3456789}
     curve = values | {"task": "circle", "task_kind": "curve"}
     runs = pd.DataFrame([made_up_row("0", **values), made_up_row("1", **curve)])
-    pages = {"moves": tables.move_tables(runs)["exp1"], "curves": tables.curve_tables(runs)["circle"]}
+    pages = {
+        "moves": tables.move_tables(runs)["exp1"],
+        "curves": tables.curve_tables(runs)["circle"],
+    }
     pages |= {"cost": tables.cost_table(runs[:1]), "runs": tables.runs_table(runs)}
-    shown = {name: {heading: table[group, heading][0] for group, heading in table} for name, table in pages.items()}
+    shown = {
+        name: {heading: table[group, heading][0] for group, heading in table}
+        for name, table in pages.items()
+    }
     for table in shown.values():
         for name in ("controller", "number", "settled [%]", "followed [%]", "lost [%]"):
             table.pop(name, None)
@@ -199,13 +247,20 @@ def test_each_metric_is_shown_in_its_unit_with_its_digits():
 
 def test_every_place_that_a_metric_names_exists():
     for metric in METRICS.values():
-        assert all(group in tables.GROUPS[table] for table, group in metric.tables.items()), metric.column
+        assert all(group in tables.GROUPS[table] for table, group in metric.tables.items()), (
+            metric.column
+        )
         assert metric.figure in ("", *FIGURES), metric.column
 
 
 def test_a_folder_says_which_of_its_controllers_have_the_aids(monkeypatch):
     every = {f"aids.{name}": value for name, value in EQUIPPED.items()}
-    sections = {"ukf_mfac": every, "Mine": {"gain": 2.0}, "ukf_mpc": every | {"aids.limit": "scale"}, "run": {}}
+    sections = {
+        "ukf_mfac": every,
+        "Mine": {"gain": 2.0},
+        "ukf_mpc": every | {"aids.limit": "scale"},
+        "run": {},
+    }
     manifest = {
         "controllers": ["ukf_mfac", "Mine", "ukf_mpc", "fmu:a.fmu"],
         "configuration": sections | {"fmu:a.fmu": {}},

@@ -8,7 +8,12 @@ import pytest
 
 from kit.command import carried_out, servobench
 from kit.folders import sweep
-from servobench.harness.analysis.folder import describe_folder, latex_tables, methods_paragraph, titled_runs
+from servobench.harness.analysis.folder import (
+    describe_folder,
+    latex_tables,
+    methods_paragraph,
+    titled_runs,
+)
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch.api import compare
 from servobench.harness.batch.results import load_runs, load_steps
@@ -45,7 +50,13 @@ def test_a_table_has_headings_in_lines_units_below_and_every_sign_escaped():
 def printed(tmp_path_factory):
     """The LaTeX of two short runs in which a setting is not the default."""
     out = tmp_path_factory.mktemp("paper") / "out"
-    compare(["constant", "calibrated"], tasks=["exp2"], seeds=2, settings={"exp2": {"duration": 2.0}}, out=out)
+    compare(
+        ["constant", "calibrated"],
+        tasks=["exp2"],
+        seeds=2,
+        settings={"exp2": {"duration": 2.0}},
+        out=out,
+    )
     return out
 
 
@@ -55,7 +66,10 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
     assert re.search(r"Python 3\.\d+\.\d+, numpy [\d.]+, scipy [\d.]+\)", text)
     assert "Controllers: constant, calibrated; tasks: exp2; plant: kinematic (UR5)" in text
     assert "the same 2 random robots (seeds 0, 1; 4 runs)" in text
-    assert "any controller can have): without aids: constant; with all aids but model: calibrated." in text
+    assert (
+        "any controller can have): without aids: constant; with all aids but model: calibrated."
+        in text
+    )
     assert "Varied" not in text
     assert "Settings other than the defaults: exp2.duration = 2." in text
     assert "@misc{servobench," in text
@@ -71,14 +85,21 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     pose = "pose = {frame = 'base', position = [0.4, 0.1, 2.2], rotation = [0, 0, 0, 1]}"
     twin.write_text(f"robot = 'ur5'\n[camera]\n{pose}\n", encoding="utf-8")
     short = {"exp2": {"duration": 0.5}}
-    compare(["constant"], tasks=["exp2"], robot=str(twin), mismatches=["none"], settings=short, out=out)
+    compare(
+        ["constant"], tasks=["exp2"], robot=str(twin), mismatches=["none"], settings=short, out=out
+    )
     runs = titled_runs(out)
     text = methods_paragraph(out, runs)
-    assert "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. " in text
+    assert (
+        "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. "
+        in text
+    )
     (drawn,) = folder_figures(out, Choice(["errors"]))
     assert drawn.title.endswith("kinematic, mismatch drawn from the twin, seed 0")
     assert describe_folder(out, runs)["mismatch"] == "drawn from the twin"
-    assert [title for title, _ in statistics_tables(runs)] == ["exp2 on kinematic, drawn from the twin"]
+    assert [title for title, _ in statistics_tables(runs)] == [
+        "exp2 on kinematic, drawn from the twin"
+    ]
     pytest.importorskip("cv2")
     from servobench.harness.pictures import film, replay
 
@@ -87,10 +108,14 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
-def test_a_page_of_a_paper_can_be_typeset_with_what_is_printed(monkeypatch, capsys, printed, tmp_path):
+def test_a_page_of_a_paper_can_be_typeset_with_what_is_printed(
+    monkeypatch, capsys, printed, tmp_path
+):
     servobench(monkeypatch, "statistics", str(printed), "--latex")
     (tmp_path / "page.tex").write_text(PAGE % capsys.readouterr().out)
-    made = carried_out("pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex", cwd=tmp_path)
+    made = carried_out(
+        "pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex", cwd=tmp_path
+    )
     if "IEEEtran.cls' not found" in made.stdout or "booktabs.sty' not found" in made.stdout:
         pytest.skip("this TeX has no IEEEtran or no booktabs")
     assert made.returncode == 0, made.stdout[-2000:]

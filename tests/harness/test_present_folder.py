@@ -61,7 +61,9 @@ class Roam(Task):
 """
 
 
-def test_a_task_that_changes_the_folder_leaves_the_names_of_files_as_they_are(tmp_path, monkeypatch):
+def test_a_task_that_changes_the_folder_leaves_the_names_of_files_as_they_are(
+    tmp_path, monkeypatch
+):
     (tmp_path / "roam.py").write_text(ROAM)
     monkeypatch.chdir(tmp_path)
     assert run("constant", task="./roam.py:Roam").row["status"] == "completed"
@@ -79,8 +81,12 @@ def test_a_folder_that_is_deleted_meanwhile_does_no_harm(tmp_path, monkeypatch):
     assert Path.cwd() == tmp_path
 
 
-def test_messages_of_an_fmu_go_to_the_file_that_was_named_wherever_its_code_goes(tmp_path, monkeypatch):
-    (tmp_path / "arm.toml").write_text('file = "arm.fmu"\ninputs = "u"\nfeatures = "y"\ndebug_log = "said.txt"\n')
+def test_messages_of_an_fmu_go_to_the_file_that_was_named_wherever_its_code_goes(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "arm.toml").write_text(
+        'file = "arm.fmu"\ninputs = "u"\nfeatures = "y"\ndebug_log = "said.txt"\n'
+    )
     monkeypatch.chdir(tmp_path)
     assert read_mapping(FmuMapping, Path("arm.toml")).debug_log == tmp_path / "said.txt"
 
@@ -90,7 +96,10 @@ def test_workers_are_refused_in_a_folder_that_was_deleted(tmp_path, monkeypatch)
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
-    with pytest.raises(ConfigurationError, match="^the present folder was deleted; change to one"), open_workers(2):
+    with (
+        pytest.raises(ConfigurationError, match="^the present folder was deleted; change to one"),
+        open_workers(2),
+    ):
         pass
 
 
@@ -99,5 +108,8 @@ def test_workers_are_refused_in_a_folder_that_must_not_be_entered(monkeypatch):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     monkeypatch.setattr(os, "chdir", refuse)
-    with pytest.raises(ConfigurationError, match="cannot be entered: Permission denied; change to"), open_workers(2):
+    with (
+        pytest.raises(ConfigurationError, match="cannot be entered: Permission denied; change to"),
+        open_workers(2),
+    ):
         pass

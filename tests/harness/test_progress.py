@@ -59,7 +59,13 @@ def test_a_note_is_neither_markup_nor_words_for_the_terminal():
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(40.0, "40 s"), (119.0, "119 s"), (600.0, "10 minutes"), (9000.0, "2 hours"), (699377.0, "8 days")],
+    [
+        (40.0, "40 s"),
+        (119.0, "119 s"),
+        (600.0, "10 minutes"),
+        (9000.0, "2 hours"),
+        (699377.0, "8 days"),
+    ],
 )
 def test_a_time_is_told_in_its_largest_unit(seconds, words):
     assert show_time(seconds) == words

@@ -45,12 +45,15 @@ def test_a_lemniscate_crosses_its_centre_twice_a_lap():
 
 def test_a_line_moves_at_constant_speed_and_rests_at_its_end():
     path = line(np.zeros(2), np.array([1.0, 2.0]), 4.0)
-    np.testing.assert_allclose(path.at([-1.0, 1.0, 4.0, 9.0]), [[0, 0], [0.25, 0.5], [1, 2], [1, 2]])
+    np.testing.assert_allclose(
+        path.at([-1.0, 1.0, 4.0, 9.0]), [[0, 0], [0.25, 0.5], [1, 2], [1, 2]]
+    )
 
 
 def test_waypoints_come_back_from_a_file(tmp_path):
     file = tmp_path / "points.csv"
-    file.write_text("time_s, x_m, y_m, z_m\n0,0,0,1\n2,1,0,1\n", encoding="utf-8-sig")  # as spreadsheets write it
+    # As spreadsheets write it
+    file.write_text("time_s, x_m, y_m, z_m\n0,0,0,1\n2,1,0,1\n", encoding="utf-8-sig")
     np.testing.assert_allclose(read_waypoints(file, FEATURE).at(1.0), [0.5, 0, 1])
 
 
@@ -59,7 +62,9 @@ def test_the_columns_of_a_waypoint_file_have_the_unit_of_the_feature(tmp_path):
     file.write_text("time_s,u_px,v_px\n0,0,0\n2,100,50\n")
     pixels = Channel(("u", "v"), "px", 1000.0, np.zeros(2), np.full(2, 1000.0))
     np.testing.assert_allclose(read_waypoints(file, pixels).at(1.0), [50, 25])
-    with pytest.raises(ValueError, match="points.csv has no column x_m; it needs time_s, x_m, y_m, z_m"):
+    with pytest.raises(
+        ValueError, match="points.csv has no column x_m; it needs time_s, x_m, y_m, z_m"
+    ):
         read_waypoints(file, FEATURE)
 
 
@@ -77,7 +82,9 @@ def test_a_reference_that_cannot_be_is_refused(kind, arguments, message):
         kind(*arguments)
 
 
-PLACES = pd.DataFrame({"time_s": [0.0, 2.0, 4.0], "x_m": [0.1, 0.15, 0.1], "y_m": [0.1, 0.1, 0.15], "z_m": [1.2] * 3})
+PLACES = pd.DataFrame(
+    {"time_s": [0.0, 2.0, 4.0], "x_m": [0.1, 0.15, 0.1], "y_m": [0.1, 0.1, 0.15], "z_m": [1.2] * 3}
+)
 
 
 @pytest.mark.parametrize(
@@ -85,8 +92,12 @@ PLACES = pd.DataFrame({"time_s": [0.0, 2.0, 4.0], "x_m": [0.1, 0.15, 0.1], "y_m"
     [
         lambda table: table.set_index("time_s"),
         lambda table: table.set_index(["time_s", "x_m"]),
-        lambda table: table.set_axis(pd.MultiIndex.from_product([["robot"], table.columns]), axis=1),
-        lambda table: table.set_axis(pd.MultiIndex.from_tuples([(name, "") for name in table]), axis=1),
+        lambda table: table.set_axis(
+            pd.MultiIndex.from_product([["robot"], table.columns]), axis=1
+        ),
+        lambda table: table.set_axis(
+            pd.MultiIndex.from_tuples([(name, "") for name in table]), axis=1
+        ),
         lambda table: table.set_index(pd.Index([3, 1, 2])),
         lambda table: table.set_index(pd.Index(["a", "b", "c"], name="label")),
         lambda table: table.map(lambda number: Decimal(f"{number:.3f}")),
@@ -97,7 +108,9 @@ PLACES = pd.DataFrame({"time_s": [0.0, 2.0, 4.0], "x_m": [0.1, 0.15, 0.1], "y_m"
 def test_parquet_is_read_as_pandas_writes_it(tmp_path, change):
     change(PLACES).to_parquet(tmp_path / "way.PARQUET")
     read = read_waypoints(tmp_path / "way.PARQUET", FEATURE)
-    np.testing.assert_array_equal(read.at([0.0, 1.0, 4.0]), [[0.1, 0.1, 1.2], [0.125, 0.1, 1.2], [0.1, 0.15, 1.2]])
+    np.testing.assert_array_equal(
+        read.at([0.0, 1.0, 4.0]), [[0.1, 0.1, 1.2], [0.125, 0.1, 1.2], [0.1, 0.15, 1.2]]
+    )
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,11 @@ def line_of(kind: type) -> int:
     """Return the line of this file that ends with the comment about a crash, in the class `kind`."""
     lines = Path(__file__).read_text().splitlines()
     begin = lines.index(f"class {kind.__name__}(Resting):")
-    return next(i for i, line in enumerate(lines, 1) if i > begin and line.endswith("# the line of the crash"))
+    return next(
+        i
+        for i, line in enumerate(lines, 1)
+        if i > begin and line.endswith("# the line of the crash")
+    )
 
 
 def wrong(name: str, method: str, answer: str) -> type[Controller]:
@@ -72,7 +76,11 @@ def wrong(name: str, method: str, answer: str) -> type[Controller]:
     return names[name]
 
 
-STEP, RESET, LOOK = "step(self, observation, reference)", "reset(self, observation, seed)", "diagnostics(self)"
+STEP, RESET, LOOK = (
+    "step(self, observation, reference)",
+    "reset(self, observation, seed)",
+    "diagnostics(self)",
+)
 
 
 CRASHES = {
@@ -144,7 +152,9 @@ def test_a_fault_of_this_package_has_no_place_and_a_defect_of_it_has_one():
 
 def test_the_log_has_one_entry_a_failed_run_and_only_of_those(tmp_path):
     folder = tmp_path / "out"
-    runs = servobench.compare([Resting, KeyLost], tasks=["exp2", "random"], seeds=2, settings=SHORT, out=folder)
+    runs = servobench.compare(
+        [Resting, KeyLost], tasks=["exp2", "random"], seeds=2, settings=SHORT, out=folder
+    )
     log = (folder / results.FAILURES).read_text()
     entries = [line for line in log.splitlines() if line and not line.startswith(" ")]
     failed = runs[runs["status"] != "completed"]
@@ -224,9 +234,13 @@ class Writing(Resting):
 
 
 def test_a_controller_that_writes_into_its_arrays_changes_no_row_of_the_log():
-    alone, written = (servobench.run(kind, task="exp2", settings=SHORT) for kind in (Resting, Writing))
+    alone, written = (
+        servobench.run(kind, task="exp2", settings=SHORT) for kind in (Resting, Writing)
+    )
     assert written.row["status"] == "completed"
-    pd.testing.assert_frame_equal(*(judged(each.steps.drop(columns="run_id")) for each in (alone, written)))
+    pd.testing.assert_frame_equal(
+        *(judged(each.steps.drop(columns="run_id")) for each in (alone, written))
+    )
 
 
 class Reusing(Plain):
@@ -248,9 +262,14 @@ def test_a_plant_may_use_the_array_of_its_truth_again():
     assert truth.feature.tolist() == [0.3, 0.2]
 
 
-@pytest.mark.parametrize("answer", ["{'a': 1}", "{'a': True}", "{'a': np.float32(2.0)}", "{'a': np.array(2.0)}", "{}"])
+@pytest.mark.parametrize(
+    "answer", ["{'a': 1}", "{'a': True}", "{'a': np.float32(2.0)}", "{'a': np.array(2.0)}", "{}"]
+)
 def test_diagnostics_may_be_any_numbers(answer):
-    assert servobench.run(wrong("Right", LOOK, answer), task="exp2", settings=SHORT).row["status"] == "completed"
+    assert (
+        servobench.run(wrong("Right", LOOK, answer), task="exp2", settings=SHORT).row["status"]
+        == "completed"
+    )
 
 
 def test_a_type_error_behind_the_call_is_told_as_it_is():
@@ -263,4 +282,7 @@ def test_a_type_error_behind_the_call_is_told_as_it_is():
 def test_the_log_of_failures_holds_nothing_that_a_terminal_obeys():
     row = made_up_row("run0", status="crashed", reason="no \x1b[2J\u202e")
     entry = log_entry(row, "File x\n    \x1b]0;title\x07")
-    assert entry == "run0: crashed: no \\u001b[2J\\u202e\n    File x\n        \\u001b]0;title\\u0007\n\n"
+    assert (
+        entry
+        == "run0: crashed: no \\u001b[2J\\u202e\n    File x\n        \\u001b]0;title\\u0007\n\n"
+    )

@@ -45,7 +45,9 @@ STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}
 
 def add_part(folder, index: int, **extra: float) -> None:
     run_id = f"run{index}"
-    steps = pd.DataFrame({"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | STEPS | extra)
+    steps = pd.DataFrame(
+        {"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | STEPS | extra
+    )
     results.write_part(folder, index, [RunResult(made_up_row(run_id, seed=index) | extra, steps)])
 
 
@@ -58,7 +60,10 @@ def folder(tmp_path):
 
 def test_a_metric_of_pairs_is_refused_where_there_is_one_controller():
     alone = pd.DataFrame([made_up_row(f"run{seed}", seed=seed) for seed in range(2)])
-    with pytest.raises(ConfigurationError, match="no two controllers have runs of one seed to compare; leave --metric"):
+    with pytest.raises(
+        ConfigurationError,
+        match="no two controllers have runs of one seed to compare; leave --metric",
+    ):
         list(statistics_rows(alone, "settling_time_s"))
     ((_, controllers, pairs),) = statistics_rows(alone)
     assert (len(controllers), pairs) == (1, [])
@@ -136,7 +141,8 @@ def test_a_killed_clean_up_loses_nothing(folder):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("", "exists already; give another one as `out`"), ("file/out", "cannot be made")]
+    ("name", "message"),
+    [("", "exists already; give another one as `out`"), ("file/out", "cannot be made")],
 )
 def test_a_folder_with_something_in_it_or_that_cannot_be_made_is_refused(tmp_path, name, message):
     (tmp_path / "file").write_text("mine")
@@ -154,12 +160,16 @@ def test_a_folder_of_another_schema_is_refused(folder):
 
 
 def without_file(name: str) -> Callable[[Path], None]:
-    return lambda folder: (comparison(folder, controllers=("constant",), tasks=("exp1",)) / name).unlink()
+    return lambda folder: (
+        comparison(folder, controllers=("constant",), tasks=("exp1",)) / name
+    ).unlink()
 
 
 def of_schema_3(folder: Path) -> None:
     manifest = comparison(folder, controllers=("constant",), tasks=("exp1",)) / results.MANIFEST
-    manifest.write_text(manifest.read_text().replace('"schema_version": "4"', '"schema_version": "3"'))
+    manifest.write_text(
+        manifest.read_text().replace('"schema_version": "4"', '"schema_version": "3"')
+    )
     (folder / SUMS).unlink()
 
 
@@ -209,7 +219,9 @@ def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder
 
 
 def test_the_manifest_is_json_for_every_reader(tmp_path):
-    results.create_folder(tmp_path / "out", {"limit": float("inf"), "low": (1.5, float("-inf")), "count": 3})
+    results.create_folder(
+        tmp_path / "out", {"limit": float("inf"), "low": (1.5, float("-inf")), "count": 3}
+    )
     text = (tmp_path / "out" / results.MANIFEST).read_text(encoding="utf-8")
     assert text.startswith('{\n  "schema_version": "4",\n  "limit": "inf",\n')
     manifest = json.loads(text)
@@ -218,7 +230,9 @@ def test_the_manifest_is_json_for_every_reader(tmp_path):
 
 def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(folder):
     for index, latency in enumerate((None, 2, None)):
-        results.write_part(folder, index, [RunResult(made_up_row(f"run{index}", latency_s=latency), None)])
+        results.write_part(
+            folder, index, [RunResult(made_up_row(f"run{index}", latency_s=latency), None)]
+        )
     before = results.load_runs(folder)
     results.collect(folder)
     pd.testing.assert_frame_equal(results.load_runs(folder), before)
@@ -226,14 +240,19 @@ def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(f
 
 
 def test_what_is_no_number_is_null_and_a_column_of_it_one_of_numbers():
-    rows = [{"some": np.nan, "none": np.nan, "latency_s": None, "nothing": None}, {"some": 2.0, "none": np.nan}]
+    rows = [
+        {"some": np.nan, "none": np.nan, "latency_s": None, "nothing": None},
+        {"some": 2.0, "none": np.nan},
+    ]
     table = tables.as_table(rows)
     assert [str(each) for each in table.schema.types] == ["double", "double", "double", "null"]
     assert [column.null_count for column in table.columns] == [1, 2, 2, 2]
 
 
 def test_a_part_of_several_runs_says_which_runs_are_there(folder):
-    results.write_part(folder, 8, [RunResult(made_up_row(f"run{index}"), None) for index in (8, 9, 10)])
+    results.write_part(
+        folder, 8, [RunResult(made_up_row(f"run{index}"), None) for index in (8, 9, 10)]
+    )
     add_part(folder, 2)
     assert results.finished_runs(folder) == [range(2, 3), range(8, 11)]
 
@@ -251,7 +270,9 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(OSError, match="Not a directory"):
-        write_atomically(path / "page", lambda _: pytest.fail("its content is made although it cannot be kept"))
+        write_atomically(
+            path / "page", lambda _: pytest.fail("its content is made although it cannot be kept")
+        )
 
 
 def test_a_file_and_its_name_are_on_the_disk_before_the_next_is_written(tmp_path, monkeypatch):
@@ -263,7 +284,10 @@ def test_a_file_and_its_name_are_on_the_disk_before_the_next_is_written(tmp_path
     monkeypatch.setattr("os.fsync", note)
     write_atomically(tmp_path / "table", lambda file: file.write_text("new"))
     name = partial_path(tmp_path / "table").name
-    assert kept == [((tmp_path / "table").stat().st_ino, [name]), (tmp_path.stat().st_ino, ["table"])]
+    assert kept == [
+        ((tmp_path / "table").stat().st_ino, [name]),
+        (tmp_path.stat().st_ino, ["table"]),
+    ]
 
 
 def test_a_file_that_cannot_be_read_while_another_is_made_is_not_said_to_be_written(tmp_path):
@@ -280,7 +304,11 @@ def test_a_file_that_cannot_be_read_while_another_is_made_is_not_said_to_be_writ
 def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
     cv2 = pytest.importorskip("cv2")
     picture = np.full((6, 8, 3), (200, 30, 10), dtype=np.uint8)
-    results.write_part(folder, 0, [RunResult(made_up_row("run0"), None, picture), RunResult(made_up_row("run1"), None)])
+    results.write_part(
+        folder,
+        0,
+        [RunResult(made_up_row("run0"), None, picture), RunResult(made_up_row("run1"), None)],
+    )
     results.write_part(folder, 2, [RunResult(made_up_row("run2"), None, picture)])
     written = sorted((folder / results.PICTURES).iterdir())
     assert [path.name for path in written] == ["run0.png", "run2.png"]
@@ -289,10 +317,17 @@ def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
 
 
 def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
-    tables = {name: pd.DataFrame([made_up_row(f"{name}{i}", seed=i) for i in range(2)]) for name in "ab"}
+    tables = {
+        name: pd.DataFrame([made_up_row(f"{name}{i}", seed=i) for i in range(2)]) for name in "ab"
+    }
     results.write_summary(folder, tables, {"parts": ["a", "b"]})
     runs = results.load_runs(folder)
-    assert runs[["run_id", "part"]].values.tolist() == [["a0", "a"], ["a1", "a"], ["b0", "b"], ["b1", "b"]]
+    assert runs[["run_id", "part"]].values.tolist() == [
+        ["a0", "a"],
+        ["a1", "a"],
+        ["b0", "b"],
+        ["b1", "b"],
+    ]
     assert list(runs) == [*tables["a"], "part"]
     assert results.read_manifest(folder)["parts"] == ["a", "b"]
 
@@ -319,7 +354,15 @@ def read_runs(folder):
     list(statistics_rows(runs))
     list(summary_tables(runs))
     summary_legend(runs)
-    makers = (overview, move_tables, curve_tables, cost_table, outcome_table, failure_table, runs_table)
+    makers = (
+        overview,
+        move_tables,
+        curve_tables,
+        cost_table,
+        outcome_table,
+        failure_table,
+        runs_table,
+    )
     for make in (*makers, judge, leaders):
         make(runs)
     draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
@@ -337,7 +380,9 @@ def read_steps(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "read"), [(results.RUNS, read_runs), (results.STEPS, read_steps)])
-def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_one_line(tmp_path, kind, read):
+def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_one_line(
+    tmp_path, kind, read
+):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "rls"), tasks=("exp1", "circle"))
     (folder / SUMS).unlink()
     whole = pd.read_parquet(folder / kind)
@@ -352,8 +397,12 @@ def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_on
             read(folder)
         except ConfigurationError as error:
             refused[names[0]] = str(error)
-    assert all(name in line and len(line.splitlines()) == 1 for name, line in refused.items()), refused
-    assert sorted(name for name, line in refused.items() if str(folder / kind) in line) == sorted(needed)
+    assert all(name in line and len(line.splitlines()) == 1 for name, line in refused.items()), (
+        refused
+    )
+    assert sorted(name for name, line in refused.items() if str(folder / kind) in line) == sorted(
+        needed
+    )
     assert set(refused) <= keys
 
 
@@ -361,8 +410,12 @@ def test_a_run_that_does_not_say_which_it_is_is_named(tmp_path):
     folder = comparison(tmp_path / "out")
     (folder / SUMS).unlink()
     runs = results.load_runs(folder)
-    runs.assign(controller=runs["controller"].where(runs.index != 1)).to_parquet(folder / results.RUNS)
-    with pytest.raises(ConfigurationError, match=r"runs.parquet is no table of runs: row 1 has no controller$"):
+    runs.assign(controller=runs["controller"].where(runs.index != 1)).to_parquet(
+        folder / results.RUNS
+    )
+    with pytest.raises(
+        ConfigurationError, match=r"runs.parquet is no table of runs: row 1 has no controller$"
+    ):
         results.load_runs(folder)
     runs.drop(columns="settling_time_s").assign(status="crashed").to_parquet(folder / results.RUNS)
     assert len(results.load_runs(folder)) == len(runs)  # no run has one
@@ -371,18 +424,23 @@ def test_a_run_that_does_not_say_which_it_is_is_named(tmp_path):
 def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
     folder = comparison(tmp_path / "out")
     (folder / SUMS).unlink()
-    pd.DataFrame({"run_id": ["a"], "plant": ["kinematic"], "x": [1.0]}).to_parquet(folder / results.RUNS)
+    pd.DataFrame({"run_id": ["a"], "plant": ["kinematic"], "x": [1.0]}).to_parquet(
+        folder / results.RUNS
+    )
     lack = "lacks the columns controller, task, mismatch, seed, status"
     with pytest.raises(ConfigurationError, match=f"runs.parquet is no table of runs: it {lack}$"):
         results.load_runs(folder)
     assert lack in [finding.fault for finding in examine(folder).findings]
     pd.DataFrame({"run_id": ["a"], "time_s": [0.0]}).to_parquet(folder / results.STEPS)
-    with pytest.raises(ConfigurationError, match="is no table of steps: it lacks the column error_norm$"):
+    with pytest.raises(
+        ConfigurationError, match="is no table of steps: it lacks the column error_norm$"
+    ):
         results.load_steps(folder)
 
 
 @pytest.mark.parametrize(
-    "run_id", ["../../escaped", "/tmp/escaped", "..", ".hidden", "a\\b", "a\0b", "a b", "", "-rf", "=1", 3]
+    "run_id",
+    ["../../escaped", "/tmp/escaped", "..", ".hidden", "a\\b", "a\0b", "a b", "", "-rf", "=1", 3],
 )
 def test_a_run_identifier_that_is_unfit_for_a_file_is_refused(tmp_path, run_id):
     folder = write_folder(tmp_path / "out", [made_up_row(run_id)], [made_up_steps("a")])
@@ -395,7 +453,8 @@ def test_a_run_identifier_that_is_unfit_for_a_file_is_refused(tmp_path, run_id):
 def unfinished(tmp_path, monkeypatch):
     """The folder `out` below the working directory, with two of three runs; reports on it have no pictures."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])  # which take seconds
+    # Which take seconds
+    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])
     results.create_folder(Path("out"), {"run_count": 3})
     for index in range(2):
         add_part(Path("out"), index)
@@ -405,7 +464,9 @@ def unfinished(tmp_path, monkeypatch):
 MISSING = "2 of 3 runs are there: --resume carries out the others"
 
 
-@pytest.mark.parametrize("command", ["export out --out files", "report out", "statistics out", "verify out"])
+@pytest.mark.parametrize(
+    "command", ["export out --out files", "report out", "statistics out", "verify out"]
+)
 def test_commands_first_say_how_many_runs_of_a_batch_are_missing(output_of, unfinished, command):
     assert output_of(*command.split()).startswith(f"{MISSING}\n")
     if command == "report out":
@@ -418,7 +479,9 @@ def test_commands_first_say_how_many_runs_of_a_batch_are_missing(output_of, unfi
 @pytest.mark.parametrize("command", ["export out --out files", "statistics out"])
 def test_commands_first_say_that_a_folder_has_lost_its_checksums(output_of, unfinished, command):
     (unfinished / SUMS).unlink()
-    assert output_of(*command.split()).startswith(f"{MISSING}; SHA256SUMS is missing, so that nothing vouches for")
+    assert output_of(*command.split()).startswith(
+        f"{MISSING}; SHA256SUMS is missing, so that nothing vouches for"
+    )
 
 
 def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, unfinished):
@@ -432,7 +495,9 @@ def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, unfini
 def test_a_number_whose_square_no_number_can_be_is_refused(tmp_path, value):
     rows = [made_up_row("a", settling_time_s=1.0), made_up_row("b", settling_time_s=value)]
     folder = write_folder(tmp_path / "out", rows, [made_up_steps("a"), made_up_steps("b")])
-    with pytest.raises(ConfigurationError, match=re.escape(f"no table of runs: settling_time_s is {value:g}")):
+    with pytest.raises(
+        ConfigurationError, match=re.escape(f"no table of runs: settling_time_s is {value:g}")
+    ):
         results.load_runs(folder)
 
 
@@ -440,5 +505,7 @@ def test_an_empty_table_of_runs_is_named_for_pages_figures_and_notebooks(tmp_pat
     runs = pd.DataFrame({"run_id": []})
     with pytest.raises(ConfigurationError, match="^out holds no finished run$"):
         results.check_runs(Path("out"), runs)
-    notebook = (Path(__file__).parents[2] / "notebooks" / "analysis.ipynb").read_text(encoding="utf-8")
+    notebook = (Path(__file__).parents[2] / "notebooks" / "analysis.ipynb").read_text(
+        encoding="utf-8"
+    )
     assert "results.check_runs(RESULTS, runs)" in notebook

@@ -49,13 +49,17 @@ def test_runs_of_a_panda_side_by_side_have_the_rows_of_single_ones():
     assert_rows_of_single_runs([resolve(each, settings) for each in requests])
 
 
-@pytest.mark.parametrize("task", ["circle", "lemniscate", "line", "target", "unreachable", "endurance", "random"])
+@pytest.mark.parametrize(
+    "task", ["circle", "lemniscate", "line", "target", "unreachable", "endurance", "random"]
+)
 def test_a_task_is_as_far_away_as_the_arm_is_long(task):
     robot, entry = find_robot("ur3e"), TASKS[task]
     own, scale = fitted(task, robot), robot.workspace.scale
     for name in ("centre", "begin", "end", "target"):
         if hasattr(own, name):
-            np.testing.assert_allclose(getattr(own, name), scale * np.array(getattr(entry.default, name)))
+            np.testing.assert_allclose(
+                getattr(own, name), scale * np.array(getattr(entry.default, name))
+            )
     for name in ("radius", "shortest", "lowest"):
         if getattr(own, name, None) is not None:
             assert getattr(own, name) == pytest.approx(scale * getattr(entry.default, name))
@@ -85,17 +89,23 @@ def test_the_manifest_says_which_arm_it_was(tmp_path):
 
 def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
     monkeypatch.setattr(registry, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
-    with pytest.raises(ConfigurationError, match="brings a robot of its own, so the robot panda does not apply"):
+    with pytest.raises(
+        ConfigurationError, match="brings a robot of its own, so the robot panda does not apply"
+    ):
         resolve(PANDA, Settings())
 
 
 @pytest.mark.slow
 def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
-    request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
+    request = replace(
+        PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none"
+    )
     experiment = build(resolve(request, Settings()))
     knowledge = experiment.controller.servo.knowledge
     assert (knowledge.nominal_jacobian, knowledge.train) == (None, None)
-    config, known = (default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True))
+    config, known = (
+        default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True)
+    )
     assert (config.initial.source, known.initial.source) == ("probe", "nominal")
     assert config.estimator == type(config.estimator)() != known.estimator
     assert (config.law, config.aids) == (known.law, known.aids)
@@ -106,7 +116,10 @@ def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
 
 def test_what_counts_on_no_model_keeps_its_values_on_an_arm_that_nobody_knows():
     published, bound = find_controller("ukf_mfac:published"), find_controller("calibrated")
-    assert default_config(published, model_known=False).estimator == default_config(published).estimator
+    assert (
+        default_config(published, model_known=False).estimator
+        == default_config(published).estimator
+    )
     assert default_config(bound, model_known=False) == default_config(bound)
 
 
@@ -125,34 +138,52 @@ def test_bounds_are_given_the_kinematics_of_rippled_gears():
 @NEEDS_MUJOCO
 def test_worlds_without_gears_and_tool_are_refused_in_one_line():
     mismatch = "moderate+backlash=2deg"
-    with pytest.raises(ConfigurationError, match="mujoco has no mechanics.backlash, .*those of kinematic and fmu"):
+    with pytest.raises(
+        ConfigurationError, match="mujoco has no mechanics.backlash, .*those of kinematic and fmu"
+    ):
         resolve(RunRequest("mujoco", "regression_mfac", "circle", mismatch, 3), Settings())
-    with pytest.raises(ConfigurationError, match="an arm is exported without backlash: leave it out, and set"):
+    with pytest.raises(
+        ConfigurationError, match="an arm is exported without backlash: leave it out, and set"
+    ):
         arm_product(RunRequest("kinematic", "regression_mfac", "circle", mismatch, 3), "words")
 
 
 def test_the_arm_of_a_loop_has_the_settings_of_its_plant_or_refuses_them():
     request = RunRequest("kinematic", "rbf_pid:published", "target", "none", 2)
     own = {"lag": 0.2, "max_joint_speed": 0.5, "mechanics": {"tool_frequency": 12.0}}
-    plant, controller, _ = loop_products(request, Settings({"kinematic": own, "run": {"period": 0.02}}))
+    plant, controller, _ = loop_products(
+        request, Settings({"kinematic": own, "run": {"period": 0.02}})
+    )
     assert plant.description.step == controller.description.step == 0.02
     start = plant.description.start
-    assert [float(np.max(start[name])) for name in ("lag", "max_speed", "tool_frequency")] == [0.2, 0.5, 12.0]
-    with pytest.raises(ConfigurationError, match="commanded a period later: leave kinematic.sensing.latency out"):
+    assert [float(np.max(start[name])) for name in ("lag", "max_speed", "tool_frequency")] == [
+        0.2,
+        0.5,
+        12.0,
+    ]
+    with pytest.raises(
+        ConfigurationError, match="commanded a period later: leave kinematic.sensing.latency out"
+    ):
         loop_products(request, Settings({"kinematic": {"sensing": {"latency": 0.1}}}))
 
 
 def test_a_run_under_a_turning_camera_is_not_filmed():
     request = RunRequest("kinematic", "regression_mfac", "circle", "moderate+camera_turn=15deg", 3)
     result = run_experiment(request, Settings())
-    with pytest.raises(ConfigurationError, match="cannot be shown: films have no camera that turns"):
+    with pytest.raises(
+        ConfigurationError, match="cannot be shown: films have no camera that turns"
+    ):
         logged_run(result.row, result.steps)
 
 
-@pytest.mark.parametrize("setting", [{"sensing": {"camera_turn": 0.2}}, {"mechanics": {"tool_frequency": 12.0}}, {}])
+@pytest.mark.parametrize(
+    "setting", [{"sensing": {"camera_turn": 0.2}}, {"mechanics": {"tool_frequency": 12.0}}, {}]
+)
 def test_a_film_whose_ball_is_elsewhere_than_the_arm_has_it_says_so(caplog, setting):
     remark.cache_clear()
     request = RunRequest("kinematic", "regression_mfac", "exp1", "moderate", 3)
     result = run_experiment(request, Settings({"kinematic": setting, "exp1": {"duration": 3.0}}))
     logged_run(result.row, result.steps)
-    assert ("films have no play of gears, no flexible tool and no camera that turns" in caplog.text) == bool(setting)
+    assert (
+        "films have no play of gears, no flexible tool and no camera that turns" in caplog.text
+    ) == bool(setting)

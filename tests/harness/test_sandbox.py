@@ -36,12 +36,18 @@ def importing(text, name, folder, monkeypatch):
 
 
 @pytest.mark.slow
-def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(tmp_path, monkeypatch):
+def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(sandbox, "GUARD_START", 0.5)
     before = set(multiprocessing.active_children())
-    with importing("import time\n\ntime.sleep(60.0)\n", "slow_import", tmp_path, monkeypatch) as workers:
+    with importing(
+        "import time\n\ntime.sleep(60.0)\n", "slow_import", tmp_path, monkeypatch
+    ) as workers:
         for _ in range(2):
-            with pytest.raises(ConfigurationError, match=r"^a worker process has not started within 0\.5 s$"):
+            with pytest.raises(
+                ConfigurationError, match=r"^a worker process has not started within 0\.5 s$"
+            ):
                 workers.submit(Task(print, b"")).result(60.0)
     assert set(multiprocessing.active_children()) == before
 
@@ -50,7 +56,8 @@ def test_a_daemonic_process_is_told_that_it_can_start_no_workers(monkeypatch):
     monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
     workers = Pool(1, Limits(), ())
     with pytest.raises(
-        ConfigurationError, match=r"^a daemonic process, such as one of multiprocessing\.Pool, can start"
+        ConfigurationError,
+        match=r"^a daemonic process, such as one of multiprocessing\.Pool, can start",
     ):
         workers.submit(Task(print, b"")).result(60.0)
     workers.stop()
@@ -67,17 +74,29 @@ if not first.exists() or {always}:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(("SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"), "SIGTERM", "SIGSTOP"))
-def test_a_guard_that_is_ended_or_stopped_while_it_starts_is_started_once_more(name, tmp_path, monkeypatch):
-    with importing(ONCE.format(name=name, always=False), "ends_once", tmp_path, monkeypatch) as workers:
-        assert workers.submit(Task(harm, pickle.dumps("return"))).result(300.0).items == [["begins", "return"]]
+@pytest.mark.parametrize(
+    "name", some(("SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"), "SIGTERM", "SIGSTOP")
+)
+def test_a_guard_that_is_ended_or_stopped_while_it_starts_is_started_once_more(
+    name, tmp_path, monkeypatch
+):
+    with importing(
+        ONCE.format(name=name, always=False), "ends_once", tmp_path, monkeypatch
+    ) as workers:
+        assert workers.submit(Task(harm, pickle.dumps("return"))).result(300.0).items == [
+            ["begins", "return"]
+        ]
 
 
 @pytest.mark.slow
 def test_of_a_guard_that_is_ended_whenever_it_starts_the_signal_is_named(tmp_path, monkeypatch):
     with (
-        importing(ONCE.format(name="SIGKILL", always=True), "ends_always", tmp_path, monkeypatch) as workers,
-        pytest.raises(ConfigurationError, match="^a worker process was ended while it started: SIGKILL$"),
+        importing(
+            ONCE.format(name="SIGKILL", always=True), "ends_always", tmp_path, monkeypatch
+        ) as workers,
+        pytest.raises(
+            ConfigurationError, match="^a worker process was ended while it started: SIGKILL$"
+        ),
     ):
         workers.submit(Task(harm, pickle.dumps("return"))).result(300.0)
 
@@ -99,7 +118,9 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="the signals that a process blocks are read from /proc")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="the signals that a process blocks are read from /proc"
+)
 def test_ctrl_c_does_not_reach_the_first_guard_while_it_starts(tmp_path):
     (tmp_path / "starts.py").write_text(UNTOUCHED)
     done = python("starts.py", path=tmp_path)
@@ -151,7 +172,9 @@ while True:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("starts", "stopper"), [(False, ""), (True, ""), (False, STOPPER)])
-def test_what_is_stopped_once_or_for_ever_or_starts_ends_with_the_process_that_started_it(starts, stopper, tmp_path):
+def test_what_is_stopped_once_or_for_ever_or_starts_ends_with_the_process_that_started_it(
+    starts, stopper, tmp_path
+):
     (tmp_path / "killed.py").write_text(KILLED.format(starts=starts, stopper=stopper))
     (tmp_path / "imported.py").write_text(SLOW)
     done = python("killed.py", path=tmp_path)
@@ -176,7 +199,9 @@ sys.meta_path.insert(0, Stuck())
 def test_a_guard_that_has_not_yet_imported_anything_large_ends_with_a_killed_command(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(STUCK)
     words = ("compare", "--plants", "kinematic", "--controllers", "constant", "--workers", "2")
-    with start(*words, "--out", str(tmp_path / "out"), path=tmp_path, STUCK=str(tmp_path)) as process:
+    with start(
+        *words, "--out", str(tmp_path / "out"), path=tmp_path, STUCK=str(tmp_path)
+    ) as process:
         wait_for((tmp_path / "begun").exists)
         process.kill()
     wait_for(lambda: not left_behind("STUCK", str(tmp_path)), 5.0)
@@ -247,7 +272,11 @@ def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
     wait_for(lambda: has_ended(told[0]), 5.0)
 
 
-@pytest.mark.parametrize(("name", "wanted"), [("constant", ["numpy.ma"]), ("fmu:pilot.fmu", ["pandas", "numpy.ma"])])
-def test_pandas_is_imported_once_and_beyond_the_limit_of_memory_where_code_of_others_runs(name, wanted):
+@pytest.mark.parametrize(
+    ("name", "wanted"), [("constant", ["numpy.ma"]), ("fmu:pilot.fmu", ["pandas", "numpy.ma"])]
+)
+def test_pandas_is_imported_once_and_beyond_the_limit_of_memory_where_code_of_others_runs(
+    name, wanted
+):
     with open_workers(2, bounds=Bounds(run_memory=150e6), controllers=[name]) as workers:
         assert workers.submit(Task(say_modules, pickle.dumps(None))).result().items == [wanted]

@@ -52,7 +52,9 @@ def test_the_interval_of_an_interquartile_mean_is_stratified_by_challenge():
 def test_the_interval_is_scipys():
     sample = np.random.default_rng(4).uniform(0.2, 0.8, 60)
     middle = ranking(tidy("score", {"a": {"x": sample}}))[0].score
-    wanted = stats.bootstrap((sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0)
+    wanted = stats.bootstrap(
+        (sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0
+    )
     low, high = wanted.confidence_interval
     assert (middle.low, middle.high) == pytest.approx((low, high), abs=0.05 * (high - low))
 
@@ -63,7 +65,10 @@ def test_methods_that_cannot_be_told_apart_share_a_rank_and_the_next_one_has_its
     values = {
         "worst": {"x": robots - 0.3, "y": np.where(np.arange(60) < 15, 0.0, robots - 0.2)},
         "best": {"x": robots, "y": robots},
-        "alike": {"x": robots + generator.normal(0.0, 0.02, 60), "y": robots + generator.normal(0.0, 0.02, 60)},
+        "alike": {
+            "x": robots + generator.normal(0.0, 0.02, 60),
+            "y": robots + generator.normal(0.0, 0.02, 60),
+        },
     }
     ranked = ranking(tidy("score", values))
     assert {each.controller: each.rank for each in ranked} == {"best": 1, "alike": 1, "worst": 3}
@@ -83,7 +88,9 @@ def test_methods_are_told_apart_at_five_percent_of_both_sides(seed, ranks):
     generator = np.random.default_rng(seed)
     robots = generator.uniform(0.3, 0.7, 20)
     other = robots + 0.02 + generator.normal(0.0, 0.045, 20)
-    assert [each.rank for each in ranking(tidy("score", {"a": {"x": other}, "b": {"x": robots}}))] == ranks
+    assert [
+        each.rank for each in ranking(tidy("score", {"a": {"x": other}, "b": {"x": robots}}))
+    ] == ranks
 
 
 def test_equal_methods_share_a_rank_without_a_deviation():
@@ -93,18 +100,30 @@ def test_equal_methods_share_a_rank_without_a_deviation():
 
 
 def test_a_rank_is_shared_with_the_best_one_in_it_and_not_with_the_last():
-    robots, noise = np.random.default_rng(6).uniform(0.3, 0.7, 60), np.random.default_rng(7).normal(0.0, 0.1, 60)
+    robots, noise = (
+        np.random.default_rng(6).uniform(0.3, 0.7, 60),
+        np.random.default_rng(7).normal(0.0, 0.1, 60),
+    )
     values = {"best": robots, "noisy": robots - 0.01 + noise - noise.mean(), "worse": robots - 0.02}
     ranked = ranking(tidy("score", {name: {"x": own} for name, own in values.items()}))
-    assert [(each.rank, each.controller) for each in ranked] == [(1, "best"), (1, "noisy"), (3, "worse")]
+    assert [(each.rank, each.controller) for each in ranked] == [
+        (1, "best"),
+        (1, "noisy"),
+        (3, "worse"),
+    ]
 
 
 def test_a_profile_counts_pairs_within_a_factor_of_the_best():
-    table = tidy("value", {"a": {"x": [1.0, 2.0], "y": [4.0, np.nan]}, "b": {"x": [2.0, 1.0], "y": [np.nan, np.nan]}})
+    table = tidy(
+        "value",
+        {"a": {"x": [1.0, 2.0], "y": [4.0, np.nan]}, "b": {"x": [2.0, 1.0], "y": [np.nan, np.nan]}},
+    )
     shares = profile(table, (1.0, 2.0))
     assert shares.loc[1.0].to_dict() == {"a": 0.5, "b": 0.25}
     assert shares.loc[2.0].to_dict() == {"a": 0.75, "b": 0.5}
-    assert profile(tidy("value", {"b": {"x": [1.0]}, "a": {"x": [2.0]}}), (1.0,)).columns.tolist() == ["b", "a"]
+    assert profile(
+        tidy("value", {"b": {"x": [1.0]}, "a": {"x": [2.0]}}), (1.0,)
+    ).columns.tolist() == ["b", "a"]
     for factors in ((0.5,), (0.5, 2.0)):
         with pytest.raises(ValueError, match=r"factors must be at least 1, got 0\.5"):
             profile(table, factors)
@@ -113,7 +132,9 @@ def test_a_profile_counts_pairs_within_a_factor_of_the_best():
 def test_halves_of_four_robots_differ_as_all_splits_say():
     """Two challenges repeat each other's scores, so a robot must be in the same half of both."""
     own = np.array([0.1, 0.2, 0.4, 0.8])
-    found = resolution(tidy("score", {"a": {"x": own, "y": own}, "b": {"x": own - 0.1, "y": own - 0.1}}))
+    found = resolution(
+        tidy("score", {"a": {"x": own, "y": own}, "b": {"x": own - 0.1, "y": own - 0.1}})
+    )
     halves = [list(half) for half in itertools.combinations(range(4), 2)]
     # The middle two of four scores that come in pairs are one of either pair: their mean is that of both robots.
     differences = [abs(own[half].mean() - np.delete(own, half).mean()) for half in halves]
@@ -139,8 +160,14 @@ def test_an_incomplete_table_is_refused():
     table = tidy("score", {"a": {"x": [0.1, 0.2]}, "b": {"x": [0.3, 0.4]}})
     for wrong, message in (
         (table.iloc[:-1], "b lacks the score of challenge x, seed 1: methods need the same runs"),
-        (table.assign(score=[0.1, 0.2, np.nan, np.nan]), "b lacks the score of challenge x, seed 0"),
-        (pd.concat([table, table.iloc[-1:]]), "b has several runs of challenge x, seed 1: keep one"),
+        (
+            table.assign(score=[0.1, 0.2, np.nan, np.nan]),
+            "b lacks the score of challenge x, seed 0",
+        ),
+        (
+            pd.concat([table, table.iloc[-1:]]),
+            "b has several runs of challenge x, seed 1: keep one",
+        ),
         (table.iloc[:0], "table must hold at least one run"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -21,7 +21,10 @@ def test_seeds_outside_the_tuning_range_judge():
 
 
 def test_the_refusal_counts_the_others_and_says_what_to_take():
-    with pytest.raises(ConfigurationError, match=r"seed 10000 and 2 more .* take seeds below 10000 or from 20000 on"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"seed 10000 and 2 more .* take seeds below 10000 or from 20000 on",
+    ):
         refuse_tuning_seeds(range(9_999, 10_003))
 
 

@@ -48,7 +48,9 @@ def test_laws_and_estimators_see_a_metre_whatever_the_unit():
     experiment = build(resolve(request("position"), Settings({})))
     knowledge = experiment.controller.servo.knowledge
     spec = replace(knowledge.spec, feature=replace(knowledge.spec.feature, unit="mm", scale=1000.0))
-    in_mm = replace(knowledge, spec=spec, nominal_jacobian=lambda q: 1000.0 * knowledge.nominal_jacobian(q))
+    in_mm = replace(
+        knowledge, spec=spec, nominal_jacobian=lambda q: 1000.0 * knowledge.nominal_jacobian(q)
+    )
     entry, plant = METHODS["ukf_mfac"], experiment.plant
     pair = [entry.build(entry.config(), each) for each in (knowledge, in_mm)]
     seen = plant.reset(3)
@@ -57,10 +59,15 @@ def test_laws_and_estimators_see_a_metre_whatever_the_unit():
         controller.reset(seen.with_values(seen.joint_position, unit * seen.feature), 0)
     for k in range(40):
         commands = [
-            controller.step(seen.with_values(seen.joint_position, unit * seen.feature), unit * desired[k : k + 11])
+            controller.step(
+                seen.with_values(seen.joint_position, unit * seen.feature),
+                unit * desired[k : k + 11],
+            )
             for controller, unit in zip(pair, (1.0, 1000.0), strict=True)
         ]
-        np.testing.assert_allclose(commands[1].joint_velocity, commands[0].joint_velocity, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(
+            commands[1].joint_velocity, commands[0].joint_velocity, rtol=1e-6, atol=1e-9
+        )
         jacobians = [controller.estimated_jacobian() for controller in pair]
         np.testing.assert_allclose(jacobians[1], 1000.0 * jacobians[0], rtol=1e-6, atol=1e-6)
         seen = plant.step(commands[0])
@@ -91,7 +98,9 @@ def test_starts_and_targets_are_in_view_and_taught_on_the_true_robot(word, seed)
     np.testing.assert_array_equal(reference.at(3.0), model.feature(reference.joint_position))
     if ":hand" in word and "plate" not in word:  # where a fixed circle might leave the view
         curve = drawn(word, "circle", seed)
-        assert curve.true.valid_at(curve.scenario.reference.points(np.linspace(0.0, 10.0, 16))).all()
+        assert curve.true.valid_at(
+            curve.scenario.reference.points(np.linspace(0.0, 10.0, 16))
+        ).all()
 
 
 @pytest.mark.parametrize("word", ["pixel", "stereo"])
@@ -105,7 +114,9 @@ def test_curves_are_the_image_of_the_ball_on_the_curve_of_position(word, task):
     camera, f = here.true.optics, here.true.optics.focal[0]
     a = place[:, :2] / place[:, 2:]
     bent = a * (1.0 + camera.distortion[0] * (a**2).sum(axis=1, keepdims=True))
-    np.testing.assert_allclose(here.scenario.reference.at(times)[:, :2], camera.centre[0] + f * bent, rtol=1e-10)
+    np.testing.assert_allclose(
+        here.scenario.reference.at(times)[:, :2], camera.centre[0] + f * bent, rtol=1e-10
+    )
 
 
 def test_a_circle_of_a_plate_keeps_its_orientation_and_is_in_reach_of_the_arm():
@@ -131,7 +142,9 @@ def test_the_canonical_tasks_displace_the_target_before_the_camera_as_they_say(w
     start = pose_start(config, robot, model)
     assert model.valid(start).all()
     pose = np.linalg.inv(model.camera)
-    home, away = (model.points(q) @ pose[:3, :3].T + pose[:3, 3] for q in (robot.workspace.home, start))
+    home, away = (
+        model.points(q) @ pose[:3, :3].T + pose[:3, 3] for q in (robot.workspace.home, start)
+    )
     D = displaced(config, home.mean(axis=0))
     np.testing.assert_allclose(away, home @ D[:3, :3].T + D[:3, 3], atol=1e-5)
     distance, angle = pose_error(away, home)
@@ -167,8 +180,11 @@ def test_the_pose_error_is_the_motion_between_two_places():
 def test_a_run_of_a_plate_has_its_true_pose_error_in_both_tables():
     result = run_experiment(request("plate", "plane_turn"), Settings({}))
     assert {"pose_error_mm", "pose_error_deg", "true_feature_u3_px"} <= set(result.steps)
-    assert result.steps["pose_error_deg"].iloc[0] == pytest.approx(30.0, abs=12.0)  # the true arm is another one
-    assert result.row["pose_error_deg"] == pytest.approx(result.steps["pose_error_deg"].iloc[-20:].mean())
+    # The true arm is another one
+    assert result.steps["pose_error_deg"].iloc[0] == pytest.approx(30.0, abs=12.0)
+    assert result.row["pose_error_deg"] == pytest.approx(
+        result.steps["pose_error_deg"].iloc[-20:].mean()
+    )
     assert result.row["pose_error_deg"] < 6.0
     assert result.row["feature_unit"] == "px"
     assert result.row["sensing"] == "plate"
@@ -178,7 +194,9 @@ def test_a_run_of_a_plate_has_its_true_pose_error_in_both_tables():
 
 def test_runs_side_by_side_are_those_of_single_runs():
     settings = Settings({"random": {"duration": 4.0}})
-    assert_rows_of_single_runs([resolve(request("stereo:hand", seed=seed), settings) for seed in (0, 1)])
+    assert_rows_of_single_runs(
+        [resolve(request("stereo:hand", seed=seed), settings) for seed in (0, 1)]
+    )
 
 
 @pytest.mark.parametrize("word", PIXEL_WORDS)
@@ -188,7 +206,10 @@ def test_moves_are_drawn_together_until_both_ends_are_in_view(word, task):
     assert run.true.valid(run.scenario.start).all()
     assert run.true.valid_at(run.scenario.reference.points(0.0)).all()
     config, home = resolve(request(word, task), Settings({})).task, robot.workspace.home
-    pairs = (run.scenario.start, config.start), (run.scenario.reference.joint_position, config.target)
+    pairs = (
+        (run.scenario.start, config.start),
+        (run.scenario.reference.joint_position, config.target),
+    )
     ways = [(q - home, given - home) for q, given in pairs if np.any(np.asarray(given) != home)]
     share = [way @ whole / (whole @ whole) for way, whole in ways]
     np.testing.assert_allclose(share, share[0])
@@ -196,7 +217,9 @@ def test_moves_are_drawn_together_until_both_ends_are_in_view(word, task):
 
 
 def test_a_start_out_of_view_is_a_run_without_a_feature():
-    settings = Settings({"exp1": {"start": [2.0, -1.69, -2.34, 0.89, 1.22, 0.0], "into_view": False}})
+    settings = Settings(
+        {"exp1": {"start": [2.0, -1.69, -2.34, 0.89, 1.22, 0.0], "into_view": False}}
+    )
     row = run_experiment(request("pixel:hand", "exp1"), settings).row
     assert row["status"] == "feature_lost"
     assert "not visible at the start" in row["reason"]
@@ -205,7 +228,9 @@ def test_a_start_out_of_view_is_a_run_without_a_feature():
 def test_a_plant_may_have_the_position_only(monkeypatch):
     entry = replace(find_plant("kinematic"), any_sensing=False)
     monkeypatch.setattr(experiment, "find_plant", lambda _: entry)
-    with pytest.raises(ConfigurationError, match="plant kinematic has the sensing position only, got pixel"):
+    with pytest.raises(
+        ConfigurationError, match="plant kinematic has the sensing position only, got pixel"
+    ):
         build(resolve(request("pixel"), Settings({})))
 
 
@@ -213,7 +238,9 @@ def test_a_plant_may_have_the_position_only(monkeypatch):
 def test_an_arm_of_four_joints_sees_with_the_others(tmp_path):
     file = write(tmp_path, FOUR_JOINTS, "four.toml")
     for word in ("pixel", "stereo"):
-        assert run_experiment(request(word, robot=str(file)), Settings({})).row["outcome"] == "settled"
+        assert (
+            run_experiment(request(word, robot=str(file)), Settings({})).row["outcome"] == "settled"
+        )
 
 
 OWN = """
@@ -237,8 +264,15 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     assert (row["outcome"], row["sensing"]) == ("settled", word)
     own, usual = (resolve(request(each), Settings({})) for each in (word, "position"))
     assert side_by_side_key(own) is None is not side_by_side_key(usual)
-    assert describe_sensing(word) == {"name": word, "features": ["r", "y", "z"], "unit": "m", "cameras": 1}
-    with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
+    assert describe_sensing(word) == {
+        "name": word,
+        "features": ["r", "y", "z"],
+        "unit": "m",
+        "cameras": 1,
+    }
+    with pytest.raises(
+        ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"
+    ):
         find_sensing(f"{file}:OTHER")
     file.write_text(OWN.replace("axis=-1", "axis=0"))
     wanted = r"sensing side: measure must return .* \(5, 3\) for points .*, got float64 of shape \(3, 5\)"
@@ -256,7 +290,8 @@ def test_networks_are_trained_on_the_features_of_a_set_up():
     training = {"jacobian": {**few, "centres": 5}, "controller": {**few, "hidden": 5}}
     settings = Settings({"rbfnn_mfac": {"training": training}})
     by_metres, by_pixels = (
-        train_networks("rbfnn_mfac", settings, lambda *_: None, "ur5", word) for word in ("position", "pixel")
+        train_networks("rbfnn_mfac", settings, lambda *_: None, "ur5", word)
+        for word in ("position", "pixel")
     )
     assert (by_metres.jacobian.m, by_pixels.jacobian.m) == (3, 2)
 
@@ -265,5 +300,7 @@ def test_networks_are_trained_on_the_features_of_a_set_up():
 def test_noise_in_pixels_is_logged_in_pixels(robot, sensing):
     noise = Settings({"kinematic": {"sensing": {"feature_noise": "2px"}}, "circle": {"laps": 4}})
     steps = run_experiment(request(sensing, "circle", "constant", robot=robot), noise).steps
-    apart = np.concatenate([steps[f"feature_{each}_px"] - steps[f"true_feature_{each}_px"] for each in "uv"])
+    apart = np.concatenate(
+        [steps[f"feature_{each}_px"] - steps[f"true_feature_{each}_px"] for each in "uv"]
+    )
     assert apart.std() == pytest.approx(2.0, abs=0.15)

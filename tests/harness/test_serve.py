@@ -46,7 +46,8 @@ def test_a_move_takes_the_time_of_a_trapezoid():
     assert done(duration / 2.0) == pytest.approx(0.5)
     assert done(0.1) == pytest.approx(1.4 * 0.1**2 / 2.0 / 0.5)
     assert [done(0.0), done(-1.0), done(duration), done(9.0)] == [0.0, 0.0, 1.0, 1.0]
-    assert profile(0.1, 5.0, 1.0)[0] == pytest.approx(2.0 * math.sqrt(0.1))  # never reaches its speed
+    # Never reaches its speed
+    assert profile(0.1, 5.0, 1.0)[0] == pytest.approx(2.0 * math.sqrt(0.1))
     assert profile(0.0, 1.0, 1.0)[0] == 0.0
 
 
@@ -103,7 +104,9 @@ def test_a_commanded_period_is_that_of_a_run(lockstep):
 
 def test_a_move_in_lockstep_ends_at_its_target():
     with served() as (server, address, _), commanding(server, address) as client:
-        target = server.rollout.observation.joint_position + np.array([0.3, -0.1, 0.2, 0.0, 0.0, 0.1])
+        target = server.rollout.observation.joint_position + np.array(
+            [0.3, -0.1, 0.2, 0.0, 0.0, 0.1]
+        )
         client.command(1, *target, 0.8, 1.4)
         assert waited_for(lambda: server.program.progress == 2)
         assert np.abs(server.rollout.observation.joint_position - target).max() < 3e-3
@@ -129,7 +132,11 @@ def test_a_served_position_is_approached():
     [
         (9, [math.nan] * 6 + [1.0, 0.1], "ended at speedJ: its numbers must be finite"),
         (9, [0.1] * 6 + [0.0, 0.1], "ended at speedJ: its acceleration must be positive, got 0"),
-        (1, [99.0] * 6 + [1.0, 1.0], "ended at moveJ: its target must be within the joints' limits"),
+        (
+            1,
+            [99.0] * 6 + [1.0, 1.0],
+            "ended at moveJ: its target must be within the joints' limits",
+        ),
         (1, [0.5] * 6 + [1e-9, 1.0], "ended at moveJ: its move must take less than 300 s"),
         (1, [0.5] * 6 + [5e-324, 5e-324], "ended at moveJ: its move must take less than 300 s"),
         (3, [], "ended at moveL (command 3), which is not served"),
@@ -138,7 +145,9 @@ def test_a_served_position_is_approached():
         (-7, [], "ended at - (command -7), which is not served"),
     ],
 )
-def test_a_command_that_cannot_be_carried_out_ends_the_program_by_name_and_the_arm_stands(number, values, said):
+def test_a_command_that_cannot_be_carried_out_ends_the_program_by_name_and_the_arm_stands(
+    number, values, said
+):
     with served() as (server, address, lines), commanding(server, address) as client:
         client.command(9, *[0.2] * 6, 1.0, 0.05)
         client.command(number, *values)
@@ -153,7 +162,9 @@ def test_an_asynchronous_move_is_refused():
     with served() as (server, address, lines), commanding(server, address) as client:
         number, _ = client.set_up(*SPEED, "input_int_register_1")
         client.send(number, "i8di", 1, *[0.0] * 6, 1.0, 1.0, 1)
-        assert waited_for(lambda: any("asynchronous moves are not served" in line for line in lines))
+        assert waited_for(
+            lambda: any("asynchronous moves are not served" in line for line in lines)
+        )
 
 
 def test_speeds_are_clipped_as_in_a_run(lockstep):
@@ -179,7 +190,9 @@ def spec():
 
 
 def registers(command, *values):
-    return {"input_int_register_0": command} | {f"input_double_register_{k}": each for k, each in enumerate(values)}
+    return {"input_int_register_0": command} | {
+        f"input_double_register_{k}": each for k, each in enumerate(values)
+    }
 
 
 def test_a_speed_is_reached_with_its_acceleration(spec):
@@ -245,7 +258,13 @@ def test_a_second_client_that_commands_is_refused_by_either_register(lockstep):
         assert second.set_up("input_int_register_24") == (0, ["IN_USE"])
         assert second.set_up("input_int_register_18")[0] == 1
         second.close()
-    assert sum("a second client is refused: another one writes input_int_register_" in line for line in lines) == 2
+    assert (
+        sum(
+            "a second client is refused: another one writes input_int_register_" in line
+            for line in lines
+        )
+        == 2
+    )
 
 
 def test_a_variable_that_is_not_served_is_named(lockstep):
@@ -260,7 +279,9 @@ def test_a_variable_that_is_not_served_is_named(lockstep):
 def test_an_unknown_script_is_named_with_its_date_and_not_carried_out(lockstep):
     _, address, lines = lockstep
     with connected(address, "script") as script:
-        script.sendall(b'def rtde_control():\n  textmsg("RTDE Control Script Loaded (01.01.2030-12:00)")\nend\n')
+        script.sendall(
+            b'def rtde_control():\n  textmsg("RTDE Control Script Loaded (01.01.2030-12:00)")\nend\n'
+        )
         said = "a script is not carried out: 83 bytes, dated 01.01.2030-12:00, SHA-256 "
         assert waited_for(lambda: any(line.startswith(said) for line in lines)), lines
     assert script_version(b"x") == ("1 bytes, dated nowhere, SHA-256 2d711642b726…", False)
@@ -268,7 +289,9 @@ def test_an_unknown_script_is_named_with_its_date_and_not_carried_out(lockstep):
 
 def test_scripts_of_other_versions_are_named_and_not_served(monkeypatch):
     for digest, version in CONTROLLER["scripts"].items():
-        monkeypatch.setattr(hashlib, "sha256", lambda _, digest=digest: SimpleNamespace(hexdigest=lambda: digest))
+        monkeypatch.setattr(
+            hashlib, "sha256", lambda _, digest=digest: SimpleNamespace(hexdigest=lambda: digest)
+        )
         assert script_version(b"") == (f"ur-rtde {version}", "1.6.5" in version)
 
 
@@ -305,8 +328,14 @@ def test_features_come_as_lines_of_json(lockstep):
 
 
 def test_a_port_that_cannot_be_opened_is_named_with_a_remedy(lockstep):
-    for address, remedy in ((lockstep[1], "end what uses it, or serve at"), ("192.0.2.1", "serve at")):
-        with pytest.raises(ConfigurationError, match=f"30004 of {address} cannot be opened: [^;]*; {remedy} another"):
+    for address, remedy in (
+        (lockstep[1], "end what uses it, or serve at"),
+        ("192.0.2.1", "serve at"),
+    ):
+        with pytest.raises(
+            ConfigurationError,
+            match=f"30004 of {address} cannot be opened: [^;]*; {remedy} another",
+        ):
             asyncio.run(Server(REQUEST, Settings({}), print).serve(address))
 
 
@@ -339,7 +368,10 @@ def test_a_plant_that_cannot_go_on_is_a_protective_stop_that_stays(monkeypatch):
         with connected(address, "dashboard") as line, line.makefile("rwb", buffering=0) as stream:
             stream.readline()
             stream.write(b"unlock protective stop\n")
-            assert stream.readline() == b"Cannot unlock protective stop the wrist meets the table at 1.000 s\n"
+            assert (
+                stream.readline()
+                == b"Cannot unlock protective stop the wrist meets the table at 1.000 s\n"
+            )
 
 
 @pytest.mark.parametrize(
@@ -347,36 +379,77 @@ def test_a_plant_that_cannot_go_on_is_a_protective_stop_that_stays(monkeypatch):
     [
         ("RTDE", b"\x00\x01V", "RTDE: a packet must have 3 to 2059 bytes, got a size of 1"),
         ("RTDE", b"\x00\x09I\x00", "RTDE: the stream ends within a packet, after 1 bytes"),
-        ("RTDE", packed("S", b"\x00"), "RTDE: a packet of kind 'S' must have 3 bytes, got a size of 4"),
-        ("RTDE", packed("P", b"\x00"), "RTDE: a packet of kind 'P' must have 3 bytes, got a size of 4"),
-        ("RTDE", packed("V", b"\x02"), "RTDE: a packet of kind 'V' must have 5 bytes, got a size of 4"),
-        ("RTDE", VERSION_2 + packed("M", b"\x05hell"), "RTDE: a text message must be as long as its parts say, got 5"),
+        (
+            "RTDE",
+            packed("S", b"\x00"),
+            "RTDE: a packet of kind 'S' must have 3 bytes, got a size of 4",
+        ),
+        (
+            "RTDE",
+            packed("P", b"\x00"),
+            "RTDE: a packet of kind 'P' must have 3 bytes, got a size of 4",
+        ),
+        (
+            "RTDE",
+            packed("V", b"\x02"),
+            "RTDE: a packet of kind 'V' must have 5 bytes, got a size of 4",
+        ),
+        (
+            "RTDE",
+            VERSION_2 + packed("M", b"\x05hell"),
+            "RTDE: a text message must be as long as its parts say, got 5",
+        ),
         ("RTDE", packed("x"), "RTDE: kind 'x' of packet is none that a client sends"),
-        ("RTDE", packed("U", b"\x07abc"), "RTDE: data are of recipe 7, which this client has not set up"),
-        ("RTDE", VERSION_2 + packed("O", b"abc"), "RTDE: outputs need a frequency of 1 to 500 Hz, got 0"),
-        ("RTDE", packed("O", struct.pack(">d", 5e-324) + b"actual_q"), "of 1 to 500 Hz, got 4.94066e-324"),
+        (
+            "RTDE",
+            packed("U", b"\x07abc"),
+            "RTDE: data are of recipe 7, which this client has not set up",
+        ),
+        (
+            "RTDE",
+            VERSION_2 + packed("O", b"abc"),
+            "RTDE: outputs need a frequency of 1 to 500 Hz, got 0",
+        ),
+        (
+            "RTDE",
+            packed("O", struct.pack(">d", 5e-324) + b"actual_q"),
+            "of 1 to 500 Hz, got 4.94066e-324",
+        ),
         ("RTDE", packed("O", struct.pack(">d", math.nan) + b"actual_q"), "of 1 to 500 Hz, got nan"),
-        ("RTDE", packed("I", b"input_int_register_0") + packed("U", b"\x01abc"), "must be 4 bytes, got 3"),
+        (
+            "RTDE",
+            packed("I", b"input_int_register_0") + packed("U", b"\x01abc"),
+            "must be 4 bytes, got 3",
+        ),
         ("dashboard", b"x" * 9000, "dashboard: a line must have at most 4096 bytes"),
-        ("script", b"def nothing", "script: 11 bytes that are no control script are not carried out"),
+        (
+            "script",
+            b"def nothing",
+            "script: 11 bytes that are no control script are not carried out",
+        ),
         ("features", b"more\n", "features: wanted is the word pictures, got 'more'"),
     ],
 )
-def test_bytes_that_make_no_sense_are_a_line_and_the_end_of_their_connection(lockstep, port, sent, said):
+def test_bytes_that_make_no_sense_are_a_line_and_the_end_of_their_connection(
+    lockstep, port, sent, said
+):
     _, address, lines = lockstep
     with connected(address, port) as line:
         line.sendall(sent)
         line.shutdown(1)
-        assert waited_for(lambda: any(said in each and each.endswith("the connection is closed") for each in lines)), (
-            lines
-        )
+        assert waited_for(
+            lambda: any(
+                said in each and each.endswith("the connection is closed") for each in lines
+            )
+        ), lines
         while line.recv(65536):
             pass
 
 
+# A recipe and moveJ
 MOVE = packed("I", ",".join(SPEED).encode()) + packed(
     "U", b"\x01" + struct.pack(">i8d", 1, *[0.5] * 6, 1.0, 1.0)
-)  # a recipe and moveJ
+)
 METHODS = (
     "GET", "POST", "HEAD", "OPTIONS", "PUT", "DELETE", "PATCH", "TRACE", "PROPFIND", "COPY", "MOVE", "UNLOCK",
     "post", "S", "P", "!", "PO", "def", "stop",
@@ -393,10 +466,14 @@ FOREIGN = [
 
 @pytest.mark.parametrize("port", PORTS)
 @pytest.mark.parametrize("piece", [1 << 20, 1, 7])
-def test_a_browser_closes_its_connection_with_its_first_line_and_nothing_moves(lockstep, monkeypatch, port, piece):
+def test_a_browser_closes_its_connection_with_its_first_line_and_nothing_moves(
+    lockstep, monkeypatch, port, piece
+):
     """After the first line comes what a port carries out, if it reads that line as a packet, a script or a command."""
     server, address, lines = lockstep
-    monkeypatch.setattr("servobench.harness.serve.server.script_version", lambda _: ("a test", True))
+    monkeypatch.setattr(
+        "servobench.harness.serve.server.script_version", lambda _: ("a test", True)
+    )
     server.program.begin()
     before = server.rollout.k, dict(server.program.inputs)
     for first in FOREIGN:
@@ -423,10 +500,14 @@ def test_a_browser_closes_its_connection_with_its_first_line_and_nothing_moves(l
     assert not any("control program" in each for each in lines[-len(FOREIGN) :])
 
 
-def test_the_script_port_keeps_a_client_whose_script_is_not_served_and_reads_it_in_pieces(lockstep, monkeypatch):
+def test_the_script_port_keeps_a_client_whose_script_is_not_served_and_reads_it_in_pieces(
+    lockstep, monkeypatch
+):
     _, address, lines = lockstep
     known = b"def rtde_control():\n  pass\nend\n"
-    monkeypatch.setattr("servobench.harness.serve.server.script_version", lambda each: ("a test", each == known))
+    monkeypatch.setattr(
+        "servobench.harness.serve.server.script_version", lambda each: ("a test", each == known)
+    )
     said = len(lines)
     with connected(address, "script") as line:
         for byte in b"def custom():\n  textmsg(1)\nend\n" + known:
@@ -473,14 +554,20 @@ def test_a_message_is_a_line_and_an_empty_recipe_is_not_found(lockstep):
 def test_silent_connections_give_way_and_none_that_has_spoken_or_listens_does():
     with served() as (server, address, lines), ExitStack() as stack:
         client = stack.enter_context(closing(Bytes(address)))
-        dashboard, features = (stack.enter_context(connected(address, port)) for port in ("dashboard", "features"))
-        answers, frames = (stack.enter_context(each.makefile("rb")) for each in (dashboard, features))
+        dashboard, features = (
+            stack.enter_context(connected(address, port)) for port in ("dashboard", "features")
+        )
+        answers, frames = (
+            stack.enter_context(each.makefile("rb")) for each in (dashboard, features)
+        )
         dashboard.sendall(b"running\n")
         assert [answers.readline(), answers.readline()][1] == b"Program running: false\n"
         frames.readline()
         for port in PORTS:
             for _ in range(3 * CONNECTIONS):
-                stack.enter_context(connected(address, port)).sendall(b"\x00" if port == "RTDE" else b"d")
+                stack.enter_context(connected(address, port)).sendall(
+                    b"\x00" if port == "RTDE" else b"d"
+                )
         assert waited_for(lambda: all(len(each) == CONNECTIONS for each in server._open.values()))
         assert [len(each) for each in server._open.values()] == [CONNECTIONS] * len(PORTS)
         late = stack.enter_context(closing(Bytes(address)))
@@ -523,5 +610,7 @@ def test_no_random_bytes_end_the_server(lockstep):
 
 
 def test_an_arm_without_six_joints_is_no_ur():
-    with pytest.raises(ConfigurationError, match="--robot must be one with 6 joints, as every UR has, got 7"):
+    with pytest.raises(
+        ConfigurationError, match="--robot must be one with 6 joints, as every UR has, got 7"
+    ):
         Server(replace(REQUEST, robot="panda"), Settings({}), print)

@@ -14,7 +14,13 @@ from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import survey
 from servobench.harness.config import settings as defaults
 from servobench.harness.config.registry import controller_names, find_controller
-from servobench.harness.config.settings import Settings, default_config, flatten, read_settings, tuned_file
+from servobench.harness.config.settings import (
+    Settings,
+    default_config,
+    flatten,
+    read_settings,
+    tuned_file,
+)
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections
 from servobench.plant.contract import settings as contract
@@ -55,13 +61,19 @@ def resolve(*assignments: str) -> Outer:
 
 def test_assignments_reach_nested_fields_and_leave_the_rest():
     got = resolve(
-        "outer.inner.gain=2", "outer.on=true", "outer.name=b c", "outer.point=[1, 2.5]", "outer.inner.kind=two"
+        "outer.inner.gain=2",
+        "outer.on=true",
+        "outer.name=b c",
+        "outer.point=[1, 2.5]",
+        "outer.inner.kind=two",
     )
     assert got == Outer(on=True, name="b c", point=(1.0, 2.5), inner=Inner(2.0, "two"))
 
 
 def test_a_section_may_have_the_name_of_a_mapping_file():
-    got = read_settings(None, ["fmu:../my.cranes/a.toml.count=4", "fmu:../my.cranes/a.toml.inner.gain=3"])
+    got = read_settings(
+        None, ["fmu:../my.cranes/a.toml.count=4", "fmu:../my.cranes/a.toml.inner.gain=3"]
+    )
     assert got.resolve("fmu:../my.cranes/a.toml", Outer()) == Outer(count=4, inner=Inner(3.0))
 
 
@@ -72,7 +84,9 @@ def test_assignments_win_over_the_file(tmp_path):
 
 
 def test_a_default_that_differs_from_the_class_is_kept():
-    assert Settings({"outer": {"on": True}}).resolve("outer", Outer(count=9)) == Outer(count=9, on=True)
+    assert Settings({"outer": {"on": True}}).resolve("outer", Outer(count=9)) == Outer(
+        count=9, on=True
+    )
 
 
 def test_the_own_checks_of_a_foreign_dataclass_are_one_line():
@@ -88,7 +102,10 @@ def test_flatten_names_every_leaf():
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("outer.cuont=1", r"outer has no setting 'cuont': did you mean 'count'\? valid: count, inner, name, on, point"),
+        (
+            "outer.cuont=1",
+            r"outer has no setting 'cuont': did you mean 'count'\? valid: count, inner, name, on, point",
+        ),
         ("outer.inner.gian=1", r"outer.inner has no setting 'gian': did you mean 'gain'"),
         ("outer.count=true", r"outer.count must be a whole number, got True"),
         ("outer.point=[1, 'x']", r"outer.point.1 must be a number, got 'x'"),
@@ -145,7 +162,9 @@ def test_what_the_user_sets_wins_and_the_manifest_tells_the_tuned_rest(tuned):
     tuned("[settings.law]\ngain = 3.0\nstep_weight = 0.05\n")
     settings = Settings({"ukf_mfac": {"law": {"gain": 4.0}}})
     requests = [RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)]
-    manifest = describe_batch(survey(requests), resolve_sections(requests, settings), settings.sections, {})
+    manifest = describe_batch(
+        survey(requests), resolve_sections(requests, settings), settings.sections, {}
+    )
     assert manifest["configuration"]["ukf_mfac"]["law.gain"] == 4.0
     assert manifest["configuration"]["ukf_mfac"]["law.step_weight"] == 0.05
 
@@ -174,16 +193,22 @@ def test_a_file_that_does_not_fit_is_refused(tuned, text, message):
 
 
 def test_dotted_keys_are_settings_of_nested_sections():
-    given = Settings({"outer": {"inner.gain": 3.0, "inner.kind": "two", "count": 4}, "fmu:a.toml": {"lag": 0.1}})
+    given = Settings(
+        {"outer": {"inner.gain": 3.0, "inner.kind": "two", "count": 4}, "fmu:a.toml": {"lag": 0.1}}
+    )
     assert given.sections["outer"] == {"count": 4, "inner": {"gain": 3.0, "kind": "two"}}
     assert given.resolve("outer", Outer()) == Outer(count=4, inner=Inner(3.0, "two"))
-    with pytest.raises(ConfigurationError, match=r"settings give 'inner' and also 'inner\.gain', a part of it"):
+    with pytest.raises(
+        ConfigurationError, match=r"settings give 'inner' and also 'inner\.gain', a part of it"
+    ):
         Settings({"outer": {"inner.gain": 3.0, "inner": {"kind": "two"}}})
 
 
 def test_units_are_known_without_the_sources(monkeypatch):
     stored = contract._stored_strings()
-    assert json.loads(generated_tables.field_strings_of_package()) == stored, "make tables stores them"
+    assert json.loads(generated_tables.field_strings_of_package()) == stored, (
+        "make tables stores them"
+    )
     with_sources = contract.field_strings.__wrapped__(KinematicConfig)
 
     def refuse(_):

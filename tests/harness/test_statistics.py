@@ -72,7 +72,9 @@ def test_impossible_counts_are_refused(successes, runs):
 
 def test_the_bootstrap_interval_is_scipys_up_to_one_order_statistic():
     sample = np.random.default_rng(5).gamma(2.0, size=40)
-    drawn = stats.bootstrap((sample,), np.median, n_resamples=2000, method="percentile", rng=np.random.default_rng(0))
+    drawn = stats.bootstrap(
+        (sample,), np.median, n_resamples=2000, method="percentile", rng=np.random.default_rng(0)
+    )
     found = median_with_interval(sample)
     medians = np.sort(drawn.bootstrap_distribution)
     for mine, theirs in zip((found.low, found.high), drawn.confidence_interval, strict=True):
@@ -165,8 +167,14 @@ def test_a_majority_is_what_counting_all_signs_says():
 def three_controllers():
     rng = np.random.default_rng(7)
     base = rng.uniform(1.0, 2.0, 25)
-    values = np.concatenate([base, base + rng.uniform(0.1, 0.3, 25), base + rng.normal(scale=0.1, size=25)])
-    return table(controller=["a"] * 25 + ["b"] * 25 + ["c"] * 25, seed=[*range(25)] * 3, settling_time_s=values)
+    values = np.concatenate(
+        [base, base + rng.uniform(0.1, 0.3, 25), base + rng.normal(scale=0.1, size=25)]
+    )
+    return table(
+        controller=["a"] * 25 + ["b"] * 25 + ["c"] * 25,
+        seed=[*range(25)] * 3,
+        settling_time_s=values,
+    )
 
 
 def test_the_better_controller_has_a_negative_mean_difference_of_pairs_and_not_of_means():
@@ -190,7 +198,11 @@ def test_only_common_seeds_make_pairs_in_any_order_of_rows():
 
 
 def test_a_run_that_never_settled_or_ended_early_is_lost_and_worse_than_any():
-    runs = table(controller=list("ab") * 3, seed=[0, 0, 1, 1, 2, 2], settling_time_s=[1.0, NEVER, 2.0, 0.5, 3.0, 2.0])
+    runs = table(
+        controller=list("ab") * 3,
+        seed=[0, 0, 1, 1, 2, 2],
+        settling_time_s=[1.0, NEVER, 2.0, 0.5, 3.0, 2.0],
+    )
     runs.loc[3, "status"] = "feature_lost"
     (found,) = compare_pairs(runs, [("a", "b")])
     assert (found.lost, found.mean.value, found.mean.count) == ((0, 2), 1.0, 1)
@@ -198,7 +210,9 @@ def test_a_run_that_never_settled_or_ended_early_is_lost_and_worse_than_any():
 
 
 @settings(max_examples=40, deadline=None)
-@given(shift=st.floats(-0.1, 0.1), spread=st.sampled_from([0.01, 0.05, 0.2]), seed=st.integers(0, 99))
+@given(
+    shift=st.floats(-0.1, 0.1), spread=st.sampled_from([0.01, 0.05, 0.2]), seed=st.integers(0, 99)
+)
 def test_equivalent_is_what_two_one_sided_t_tests_say(shift, spread, seed):
     rng = np.random.default_rng(seed)
     first = rng.uniform(1.0, 2.0, 20)
@@ -207,7 +221,12 @@ def test_equivalent_is_what_two_one_sided_t_tests_say(shift, spread, seed):
     p_value, _, _ = ttost_paired(first, second, -0.05, 0.05)
     assert (found.verdict == "equivalent") == (p_value < 0.05)
     for side, verdict in (("less", "better"), ("greater", "worse")):
-        beyond = stats.ttest_1samp(first - second, -0.05 if side == "less" else 0.05, alternative=side).pvalue < 0.05
+        beyond = (
+            stats.ttest_1samp(
+                first - second, -0.05 if side == "less" else 0.05, alternative=side
+            ).pvalue
+            < 0.05
+        )
         assert (found.verdict == verdict) == beyond
 
 
@@ -249,15 +268,17 @@ def test_few_robots_and_samples_without_a_spread_decide_nothing_by_themselves():
 
 
 def test_margins_are_a_period_a_share_of_the_band_or_of_the_bound_and_a_hundredth():
-    runs = table(controller=["ukf_mfac", "calibrated", "calibrated", "calibrated"]).assign(settling_band=0.005)
+    runs = table(controller=["ukf_mfac", "calibrated", "calibrated", "calibrated"]).assign(
+        settling_band=0.005
+    )
     assert margin("settling_time_s", runs) == 0.05
     assert margin("settling_time_s", runs.assign(period_s=0.2)) == 0.2
     assert margin("overshoot", runs) == 0.01
     errors = runs.assign(rms_error_evaluated=[0.1, 0.0014, 0.0012, NEVER])
     assert margin("rms_error_evaluated", errors) == pytest.approx(0.2e-3)
-    assert margin("rms_error_evaluated", errors.assign(rms_error_evaluated=[0.1, 0.01, 0.02, 0.02])) == pytest.approx(
-        2e-3
-    )
+    assert margin(
+        "rms_error_evaluated", errors.assign(rms_error_evaluated=[0.1, 0.01, 0.02, 0.02])
+    ) == pytest.approx(2e-3)
     assert margin("control_effort_rad", runs) == margin("mass", runs) == 0.0
 
 
@@ -273,7 +294,10 @@ def test_shares_of_lost_runs_that_differ_by_three_points_are_equivalent():
     assert paired_difference(first, second, 0.1).verdict == "equivalent"
     first[3], second[-2:] = NEVER, NEVER  # four and two
     assert paired_difference(first, second, 0.1).verdict == "equivalent"
-    assert paired_difference(np.where(np.arange(100) < 4, NEVER, 1.0), np.ones(100), 0.1).verdict == "undecided"
+    assert (
+        paired_difference(np.where(np.arange(100) < 4, NEVER, 1.0), np.ones(100), 0.1).verdict
+        == "undecided"
+    )
 
 
 def test_a_robot_alone_and_two_of_them_have_what_can_be_known():
@@ -302,17 +326,29 @@ def test_places_are_named_with_a_sensing_set_up_that_is_not_the_usual_one():
 
 def test_a_curve_is_followed_up_to_two_bands_and_moves_count_in_percent():
     runs = table(
-        controller=["a", "b"], task_kind=["curve"] * 2, rms_error_evaluated=[0.01, 0.0101], settling_band=0.005
+        controller=["a", "b"],
+        task_kind=["curve"] * 2,
+        rms_error_evaluated=[0.01, 0.0101],
+        settling_band=0.005,
     )
     assert outcomes(runs).tolist() == ["followed", "not_followed"]
-    assert statistics.settled_share(table(controller=list("ab"), settling_time_s=[1.0, NEVER])).value == 50.0
+    assert (
+        statistics.settled_share(table(controller=list("ab"), settling_time_s=[1.0, NEVER])).value
+        == 50.0
+    )
 
 
 def test_a_margin_is_of_the_longest_period_the_widest_band_and_the_best_bound():
-    runs = table(controller=["calibrated", "nmpc_calibrated"], settling_band=[0.005, 0.05], period_s=[0.1, 0.2])
+    runs = table(
+        controller=["calibrated", "nmpc_calibrated"],
+        settling_band=[0.005, 0.05],
+        period_s=[0.1, 0.2],
+    )
     assert margin("settling_time_s", runs) == 0.2
     assert margin("rms_error_evaluated", runs) == pytest.approx(2e-3)
-    assert margin("rms_error_evaluated", runs.assign(rms_error_evaluated=[0.03, 0.05])) == pytest.approx(3e-3)
+    assert margin(
+        "rms_error_evaluated", runs.assign(rms_error_evaluated=[0.03, 0.05])
+    ) == pytest.approx(3e-3)
 
 
 @pytest.mark.parametrize(
@@ -330,7 +366,13 @@ def test_comparisons_that_cannot_be_made_are_refused(pairs, change, message):
 def test_runs_are_classed_by_how_they_ended():
     runs = table(controller=list("aabbb"), settling_time_s=[1.0, NEVER, 2.0, NEVER, 1.5])
     runs["status"] = ["completed", "completed", "feature_lost", "crashed", "completed"]
-    assert outcomes(runs).tolist() == ["settled", "not_settled", "feature_lost", "crashed", "settled"]
+    assert outcomes(runs).tolist() == [
+        "settled",
+        "not_settled",
+        "feature_lost",
+        "crashed",
+        "settled",
+    ]
     assert settling_times(runs).notna().tolist() == [True, False, False, False, True]
 
 

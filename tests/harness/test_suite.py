@@ -64,18 +64,33 @@ def test_a_challenge_fixes_its_settings_by_role_on_every_plant():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (WORLD + 'plant = "fmu"', "world.toml: challenge has no setting 'plant': did you mean 'plants'"),
+        (
+            WORLD + 'plant = "fmu"',
+            "world.toml: challenge has no setting 'plant': did you mean 'plants'",
+        ),
         (WORLD.replace("random", "circel"), "world.toml: .*'circel'.*did you mean 'circle'"),
         (WORLD.replace('why = "', '# "'), "world.toml: why is missing"),
         (WORLD.replace('reference = "calibrated"', ""), "world.toml: reference is missing"),
-        (WORLD.replace('"calibrated"', '"rls"'), "reference rls does not know the true robot; wanted calibrated"),
-        (WORLD.replace("random", "circle"), "measure settling is for moves, and circle is a curve; wanted path"),
+        (
+            WORLD.replace('"calibrated"', '"rls"'),
+            "reference rls does not know the true robot; wanted calibrated",
+        ),
+        (
+            WORLD.replace("random", "circle"),
+            "measure settling is for moves, and circle is a curve; wanted path",
+        ),
         (WORLD.replace("settling", "time"), "measure must be one of settling, path, got 'time'"),
         (WORLD + 'mismatch = "moderate+tol=3mm"', "world.toml: .*did you mean 'tool'"),
         (WORLD + "period = 0", "period must be above 0, got 0"),
-        (WORLD + "settings.kinematic.lag = 0.1", "kinematic.lag must begin with one of run., plant., task."),
+        (
+            WORLD + "settings.kinematic.lag = 0.1",
+            "kinematic.lag must begin with one of run., plant., task.",
+        ),
         (WORLD + "settings.task.lap_time = 3", "world.toml: random has no setting 'lap_time'"),
-        (WORLD + 'grade = {name = "IV", date = 2026-11-23}', "name must be one of , I, II, III, got 'IV'"),
+        (
+            WORLD + 'grade = {name = "IV", date = 2026-11-23}',
+            "name must be one of , I, II, III, got 'IV'",
+        ),
         ("title = ", "is not valid TOML"),
     ],
 )
@@ -90,11 +105,17 @@ def test_a_bad_file_is_one_line_that_names_it_and_the_fault(tmp_path, text, mess
 def test_files_that_a_challenge_names_are_found_from_its_folder(tmp_path):
     world = WORLD.replace("settling", "path")
     write(
-        tmp_path, "from servobench.harness.run.tasks import LineTask\nclass Mine(LineTask):\n    'A line.'", "a/line.py"
+        tmp_path,
+        "from servobench.harness.run.tasks import LineTask\nclass Mine(LineTask):\n    'A line.'",
+        "a/line.py",
     )
     write(tmp_path, "time_s,x_m,y_m,z_m\n0,0,0,1.3\n3,0.1,0,1.3\n", "a/way.csv")
     own = write(tmp_path, world.replace("random", "own=./line.py:Mine"), "a/own.toml")
-    way = write(tmp_path, world.replace("random", "waypoints") + "settings.task.file = 'way.csv'", "a/way.toml")
+    way = write(
+        tmp_path,
+        world.replace("random", "waypoints") + "settings.task.file = 'way.csv'",
+        "a/way.toml",
+    )
     found = choose_challenges([str(own), str(way)], [])
     assert [each.task for each in found] == ["own", "waypoints"]
     assert found[1].settings == {"task.file": str(tmp_path / "a" / "way.csv")}
@@ -102,14 +123,18 @@ def test_files_that_a_challenge_names_are_found_from_its_folder(tmp_path):
 
 def test_challenges_are_chosen_by_name_file_and_grade(tmp_path):
     file = write(tmp_path, WORLD + 'grade = {name = "II", date = 2026-11-23}', "severe.toml")
-    assert [each.title for each in choose_challenges([str(file)], ["II", "III"])] == ["A short move"]
+    assert [each.title for each in choose_challenges([str(file)], ["II", "III"])] == [
+        "A short move"
+    ]
     with pytest.raises(ConfigurationError, match="none of these challenges is of grade I: severe"):
         choose_challenges([str(file)], ["I"])
     with pytest.raises(ConfigurationError, match="two challenges are called severe"):
         choose_challenges(["severe", str(file)], [])
     with pytest.raises(ConfigurationError, match="unknown grade '3': wanted I, II, III"):
         choose_challenges(["severe"], ["3"])
-    with pytest.raises(ConfigurationError, match="unknown challenge 'sever': did you mean 'severe'"):
+    with pytest.raises(
+        ConfigurationError, match="unknown challenge 'sever': did you mean 'severe'"
+    ):
         find_challenge("sever")
 
 
@@ -127,14 +152,18 @@ def table_of(values, column, task_kind, band):
 
 def challenge(measure, **changes):
     names = ("calibrated", "nmpc_calibrated")
-    return Challenge("world", "A world", "For a reason.", "any", measure=measure, reference=names, **changes)
+    return Challenge(
+        "world", "A world", "For a reason.", "any", measure=measure, reference=names, **changes
+    )
 
 
 def test_scores_of_moves_come_out_as_by_hand():
     never = -1.0
     values = {"mine": [0.5, 2.0, never, 0.02, math.nan], "calibrated": [0.6, 1.0, 1.0, 0.01, 1.0],
               "nmpc_calibrated": [1.0, 0.5, never, 0.03, 2.0]}  # fmt: skip
-    judged = judge(challenge("settling"), table_of(values, "settling_time_s", "point_to_point", 0.005))
+    judged = judge(
+        challenge("settling"), table_of(values, "settling_time_s", "point_to_point", 0.005)
+    )
     own = judged[judged["controller"] == "mine"]
     np.testing.assert_allclose(own["score"], [1.0, 0.25, 0.0, 1.0, 0.0])
     np.testing.assert_allclose(own["reference"], [0.6, 0.5, 1.0, 0.05, 1.0])
@@ -145,7 +174,11 @@ def test_scores_of_moves_come_out_as_by_hand():
 
 
 def test_scores_of_curves_are_in_millimetres_with_a_floor_and_need_a_reference_on_the_robot():
-    values = {"mine": [0.001, 0.006, 0.011, 0.004], "calibrated": [0.0005, 0.002, 0.02], "nmpc_calibrated": [0.003] * 3}
+    values = {
+        "mine": [0.001, 0.006, 0.011, 0.004],
+        "calibrated": [0.0005, 0.002, 0.02],
+        "nmpc_calibrated": [0.003] * 3,
+    }
     judged = judge(challenge("path"), table_of(values, "rms_error_evaluated", "curve", 0.005))
     own = judged[judged["controller"] == "mine"]
     np.testing.assert_allclose(own["score"], [1.0, 2.0 / 6.0, 0.0, math.nan])
@@ -155,23 +188,33 @@ def test_scores_of_curves_are_in_millimetres_with_a_floor_and_need_a_reference_o
 
 
 def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
-    lost = {"mine": [1.0] * 20, "calibrated": [-1.0] * 2 + [1.0] * 18, "nmpc_calibrated": [-1.0] * 2 + [1.0] * 18}
-    judged = judge(challenge("settling"), table_of(lost, "settling_time_s", "point_to_point", 0.005))
+    lost = {
+        "mine": [1.0] * 20,
+        "calibrated": [-1.0] * 2 + [1.0] * 18,
+        "nmpc_calibrated": [-1.0] * 2 + [1.0] * 18,
+    }
+    judged = judge(
+        challenge("settling"), table_of(lost, "settling_time_s", "point_to_point", 0.005)
+    )
     assert {row["reference_lost"].value for row in methods_rows(judged)} == {10.0}
     assert bounded(judged).empty
     (title, _), *further = suite_tables(judged)
     assert title.startswith("world (no grade, as its references fail) on kinematic")
     assert not further
-    more = {"mine": [1.0] * 119, "calibrated": [-1.0] * 6 + [1.0] * 113}  # 5.04 %, which are printed as 5.0
+    # 5.04 %, which are printed as 5.0
+    more = {"mine": [1.0] * 119, "calibrated": [-1.0] * 6 + [1.0] * 113}
     (title, _), *_ = suite_tables(
         judge(challenge("settling"), table_of(more, "settling_time_s", "point_to_point", 0.005))
     )
     assert title.startswith("world (no grade, as its references fail)")
     rescued = lost | {"nmpc_calibrated": [-1.0] + [1.0] * 19}  # one of the two holds on this robot
-    judged = judge(challenge("settling"), table_of(rescued, "settling_time_s", "point_to_point", 0.005))
+    judged = judge(
+        challenge("settling"), table_of(rescued, "settling_time_s", "point_to_point", 0.005)
+    )
     assert {row["controller"].value for row in ranking_rows(judged)} == set(lost)
     judged = judge(
-        challenge("settling"), table_of({"calibrated": [1.0] * 4}, "settling_time_s", "point_to_point", 0.005)
+        challenge("settling"),
+        table_of({"calibrated": [1.0] * 4}, "settling_time_s", "point_to_point", 0.005),
     )
     *_, (title, _) = suite_tables(judged)
     assert title.endswith("halves of the robots differ by less than 0.001 in the score")
@@ -179,7 +222,8 @@ def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
 
 def test_pictures_of_two_mappings_of_one_name_are_four_files(tmp_path):
     judged = judge(
-        challenge("settling"), table_of({"calibrated": [1.0] * 2}, "settling_time_s", "point_to_point", 0.005)
+        challenge("settling"),
+        table_of({"calibrated": [1.0] * 2}, "settling_time_s", "point_to_point", 0.005),
     )
     drawn = [draw_suite(judged.assign(plant=f"fmu:{folder}/arm.toml"), tmp_path) for folder in "ab"]
     assert len({*drawn[0], *drawn[1]}) == 4
@@ -188,7 +232,8 @@ def test_pictures_of_two_mappings_of_one_name_are_four_files(tmp_path):
 def test_a_reference_of_some_challenges_only_has_no_rank():
     own = {"mine": [1.0] * 3, "calibrated": [1.0] * 3}
     tables = [
-        table_of(values, "settling_time_s", "point_to_point", 0.005) for values in (own, own | {"more": [1.0] * 2})
+        table_of(values, "settling_time_s", "point_to_point", 0.005)
+        for values in (own, own | {"more": [1.0] * 2})
     ]
     first, second = challenge("settling"), Challenge("other", reference=("calibrated", "more"))
     judged = pd.concat([judge(first, tables[0]), judge(second, tables[1])], ignore_index=True)
@@ -208,7 +253,11 @@ def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_
     assert "short (ungraded) on kinematic: A short move; reference" in text
     assert "ranking on kinematic over 1 of 1; halves of the robots differ by" in text
     runs = results.load_runs(tmp_path / "suite" / "short")
-    assert runs["controller"].value_counts().to_dict() == {"constant": 3, "broyden": 3, "calibrated": 2}
+    assert runs["controller"].value_counts().to_dict() == {
+        "constant": 3,
+        "broyden": 3,
+        "calibrated": 2,
+    }
     first = {name: (tmp_path / "suite" / name).read_text() for name in (RUNS, METHODS, RANKING)}
     assert (tmp_path / "suite" / "suite_kinematic.png").is_file()
     assert servobench(monkeypatch, *words, "--resume") == 0

@@ -31,9 +31,14 @@ def runs() -> pd.DataFrame:
     for seed in range(20):
         for name, time in (("quick", 1.0 + 0.01 * seed), ("slow", 2.0 + 0.02 * seed)):
             late, lost = name == "slow" and seed < 4, name == "slow" and seed == 3
-            values = {"settling_time_s": np.nan if late else time, "steady_state_error": 0.001 * (1 + seed)}
+            values = {
+                "settling_time_s": np.nan if late else time,
+                "steady_state_error": 0.001 * (1 + seed),
+            }
             values["status"] = "feature_lost" if lost else "completed"
-            rows.append(made_up_row(f"{name}-{seed}", controller=name, task="random", seed=seed, **values))
+            rows.append(
+                made_up_row(f"{name}-{seed}", controller=name, task="random", seed=seed, **values)
+            )
     return pd.DataFrame(rows)
 
 
@@ -53,7 +58,9 @@ def compare_controllers(runs, metric=None):
 def test_each_controller_has_rates_medians_tails_and_failures(runs):
     quick, slow = judge_controllers(runs).to_dict("records")
     assert quick["settled [%]"] == "100.0 [83.9, 100.0]"  # Wilson: 1/(1 + 1.96²/20)
-    assert quick["settling time [s]"].startswith("1.09 [") or quick["settling time [s]"].startswith("1.10 [")
+    assert quick["settling time [s]"].startswith("1.09 [") or quick["settling time [s]"].startswith(
+        "1.10 ["
+    )
     assert quick["its worst 5 % [mm]"] == "20.0"
     assert quick["failures"] == "none"
     assert slow["settled [%]"].startswith("80.0 [")
@@ -73,14 +80,18 @@ def test_pairs_are_compared_on_common_seeds(runs):
 
 def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     better = runs["controller"] == "quick"
-    curve = runs.assign(task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
+    curve = runs.assign(
+        task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed"
+    )
     (row,) = compare_controllers(curve).to_dict("records")
     assert row["mean difference in RMS error of the judged part [mm]"] == "-1.50 [-1.50, -1.50]"
     assert row["verdict"] == "better"
 
 
 def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
-    late = runs.assign(settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0))
+    late = runs.assign(
+        settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0)
+    )
     few = late[late["seed"] < 8]  # of which the slow one settles in four
     (row,) = compare_controllers(few).to_dict("records")
     assert row["mean difference in settling time [s]"].startswith("28.9")
@@ -94,7 +105,9 @@ def test_the_last_table_of_a_comparison_has_no_time_of_runs_that_ended_early(run
 
 
 def test_of_a_measure_without_a_good_direction_the_verdict_is_less_or_more(runs):
-    runs["max_joint_position_rad"] = np.where(runs["controller"] == "quick", 1.0, 2.0) + 0.001 * runs["seed"]
+    runs["max_joint_position_rad"] = (
+        np.where(runs["controller"] == "quick", 1.0, 2.0) + 0.001 * runs["seed"]
+    )
     (_, _), (_, pairs) = statistics_tables(runs, "max_joint_position_rad")
     assert pairs["verdict"].tolist() == ["less"]
     assert "P(A less)" in pairs
@@ -102,12 +115,18 @@ def test_of_a_measure_without_a_good_direction_the_verdict_is_less_or_more(runs)
 
 def test_a_median_over_many_conditions_is_one_over_runs_and_has_no_interval(runs):
     runs["status"] = "completed"
-    many = [runs.assign(mismatch=f"links={each}%", settling_time_s=each / 10.0) for each in range(1, 6)]
+    many = [
+        runs.assign(mismatch=f"links={each}%", settling_time_s=each / 10.0) for each in range(1, 6)
+    ]
     lost = runs.assign(mismatch="severe", settling_time_s=np.nan)
     table = overview(pd.concat([*many, lost]))
     assert table["random", "settling time [s]"].tolist() == ["0.35", "0.35"]
     both = pd.concat([*many, lost, *(each.assign(feature_unit="px") for each in many)])
-    assert {place for place, _ in overview(both)} == {"", "random, features in m", "random, features in px"}
+    assert {place for place, _ in overview(both)} == {
+        "",
+        "random, features in m",
+        "random, features in px",
+    }
 
 
 def test_a_period_that_is_set_is_the_margin_of_times(tmp_path, monkeypatch):
@@ -118,7 +137,10 @@ def test_a_period_that_is_set_is_the_margin_of_times(tmp_path, monkeypatch):
 
 
 def test_conditions_are_told_apart_in_words(runs):
-    usual, loud = runs.assign(noise_factor=1.0, latency_s=None), runs.assign(noise_factor=2.0, latency_s=0.15)
+    usual, loud = (
+        runs.assign(noise_factor=1.0, latency_s=None),
+        runs.assign(noise_factor=2.0, latency_s=0.15),
+    )
     older = runs.assign(mismatch="none")  # without the columns of both
     assert [words for words, _ in split_conditions(pd.concat([usual, older, loud]))] == [
         "random on kinematic, moderate",
@@ -127,14 +149,18 @@ def test_conditions_are_told_apart_in_words(runs):
     ]
 
 
-@pytest.mark.parametrize(("option", "word"), [((), "quick"), (("--markdown",), "| quick | 20 | 100.0 [83.9, 100.0] |")])
+@pytest.mark.parametrize(
+    ("option", "word"), [((), "quick"), (("--markdown",), "| quick | 20 | 100.0 [83.9, 100.0] |")]
+)
 def test_the_command_prints_the_tables_of_a_folder(output_of, runs, tmp_path, option, word):
     folder = write_folder(tmp_path / "out", runs.to_dict("records"), [])
     assert word in output_of("statistics", folder, *option)
 
 
 def test_the_name_of_a_sensing_set_up_is_no_emoji(capsys):
-    terminal.print_tables([("random on kinematic pixel:hand: settled", pd.DataFrame({"a": ["pixel:hand:"]}))])
+    terminal.print_tables(
+        [("random on kinematic pixel:hand: settled", pd.DataFrame({"a": ["pixel:hand:"]}))]
+    )
     printed = capsys.readouterr().out
     assert printed.count("pixel:hand:") == 2
 
@@ -157,7 +183,10 @@ os.write(2, b"drawn")
 @pytest.mark.parametrize("room", [60, 80, 100, 200])
 def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypatch, capsys, room):
     named = runs.replace({"controller": {"slow": "rbfnn_mfac:published"}})
-    tables = [("a title", judge_controllers(named)), ("paired differences", compare_controllers(named))]
+    tables = [
+        ("a title", judge_controllers(named)),
+        ("paired differences", compare_controllers(named)),
+    ]
     monkeypatch.setattr(terminal, "console", Console(width=room))
     terminal.print_tables(tables, "a legend")
     text = capsys.readouterr().out
@@ -172,7 +201,11 @@ def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypa
 
 def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, capsys):
     names = [f"a_controller_{i}" for i in range(6)]
-    conditions = [("moderate+camera_rotation=60deg", noise, latency) for noise in "014" for latency in ("0", "100")]
+    conditions = [
+        ("moderate+camera_rotation=60deg", noise, latency)
+        for noise in "014"
+        for latency in ("0", "100")
+    ]
     rows = [dict(zip(("mismatch", "noise factor", "latency [ms]"), key, strict=True)) | dict.fromkeys(names, "100.0")
             for key in conditions]  # fmt: skip
     monkeypatch.setattr(terminal, "console", Console(width=80))
@@ -197,7 +230,10 @@ def test_a_comparison_ends_with_a_table_for_each_task(tmp_path):
 
 
 def test_a_controller_slower_than_the_period_is_marked_and_counted():
-    rows = [made_up_row("a", controller="slow", controller_time_overruns=7.0), made_up_row("b", controller="quick")]
+    rows = [
+        made_up_row("a", controller="slow", controller_time_overruns=7.0),
+        made_up_row("b", controller="quick"),
+    ]
     runs = pd.DataFrame(rows)
     ((_, table),) = summary_tables(runs)
     assert table["step, median [µs]"].tolist() == ["130*", "130"]
@@ -207,7 +243,10 @@ def test_a_controller_slower_than_the_period_is_marked_and_counted():
 
 def test_the_judged_part_is_named_for_each_curve_and_that_of_a_user_s_task_is_its_own():
     curves = pd.DataFrame(
-        [made_up_row(task, task=task, task_kind="curve") for task in ("circle", "line", "Spiral", "waypoints")]
+        [
+            made_up_row(task, task=task, task_kind="curve")
+            for task in ("circle", "line", "Spiral", "waypoints")
+        ]
     )
     assert summary_legend(curves).splitlines()[1] == (
         "judged part of circle: the last lap; judged part of line, waypoints: the second half; "
@@ -232,7 +271,9 @@ def test_runs_that_never_settled_are_in_the_median_of_the_summary(runs):
 
 def test_an_endless_curve_tells_its_second_lap_and_its_joints():
     laps = {"rms_error_second_lap": 0.003, "max_joint_position_rad": 2.345, "task_kind": "curve"}
-    runs = pd.DataFrame([made_up_row("a", task="endurance", settling_time_s=np.nan, outcome="followed", **laps)])
+    runs = pd.DataFrame(
+        [made_up_row("a", task="endurance", settling_time_s=np.nan, outcome="followed", **laps)]
+    )
     ((_, table),) = summary_tables(runs)
     second, judged, joints = (
         "RMS error of the second lap [mm]", "RMS error of the judged part [mm]", "largest joint position [rad]",
@@ -240,7 +281,10 @@ def test_an_endless_curve_tells_its_second_lap_and_its_joints():
     assert table[[second, judged, joints]].iloc[0].tolist() == ["3.0", "2.0", "2.35"]
     ((_, short),) = summary_tables(runs.assign(rms_error_second_lap=runs["rms_error_evaluated"]))
     assert second not in short  # of two laps, the second one is the judged one
-    assert second not in curve_tables(runs.assign(rms_error_second_lap=0.002))["endurance"]["RMS error"]
+    assert (
+        second
+        not in curve_tables(runs.assign(rms_error_second_lap=0.002))["endurance"]["RMS error"]
+    )
 
 
 def test_the_legend_tells_the_band_of_the_feature(runs):
@@ -257,7 +301,11 @@ def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path)
     (title, table), (second, kinds) = sweep_tables([wanted.iloc[:7], wanted.iloc[7:]])
     assert second == "random on kinematic: outcomes of the runs [%]"
     assert kinds.columns.tolist() == ["controller", "settled", "feature_lost"]
-    assert kinds[["settled", "feature_lost"]].values.tolist() == [["72.2", "27.8"], ["72.2", "27.8"], ["76.5", "23.5"]]
+    assert kinds[["settled", "feature_lost"]].values.tolist() == [
+        ["72.2", "27.8"],
+        ["72.2", "27.8"],
+        ["76.5", "23.5"],
+    ]
     assert title == "random on kinematic: settled [%]"
     assert table.values.tolist() == [
         ["camera_rotation=0deg", "1", "–", "100.0", "100.0", "100.0", "6"],
@@ -271,7 +319,10 @@ def test_moves_and_curves_are_told_apart_and_tasks_that_nobody_began_are_neither
     moves, curves = split_tasks(results.load_runs(comparison(tmp_path / "a")))
     assert set(moves["task"]) == {"exp1", "exp2"}
     assert set(curves["task"]) == {"circle"}
-    assert [len(part) for part in split_tasks(results.load_runs(failed_only(tmp_path / "b")))] == [0, 0]
+    assert [len(part) for part in split_tasks(results.load_runs(failed_only(tmp_path / "b")))] == [
+        0,
+        0,
+    ]
 
 
 def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
@@ -280,7 +331,12 @@ def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
     (place,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     quick, slow = place["controllers"]
     settled = slow["settled [%]"]
-    assert (slow["controller"], slow["runs"], settled["value"], settled["count"]) == ("slow", 20, 80.0, 20)
+    assert (slow["controller"], slow["runs"], settled["value"], settled["count"]) == (
+        "slow",
+        20,
+        80.0,
+        20,
+    )
     assert quick["settled [%]"]["low"] == pytest.approx(83.9, abs=0.05)
     assert slow["its worst 5 % [mm]"] == "inf"
     (pair,) = place["pairs"]
@@ -295,4 +351,6 @@ def test_a_number_that_there_is_not_is_null_for_programs():
 
 def test_times_that_are_not_known_are_a_dash_in_the_summary(tmp_path):
     runs = results.load_runs(sweep(tmp_path / "out")).assign(controller_time_median_us=np.nan)
-    assert [str(table["step, median [µs]"].iloc[0]) for _, table in summary_tables(runs)] == ["–"] * 3
+    assert [str(table["step, median [µs]"].iloc[0]) for _, table in summary_tables(runs)] == [
+        "–"
+    ] * 3

@@ -24,7 +24,9 @@ from servobench.harness.run.tasks import TASKS, choose_task, find_task
 from servobench.plant.contract.faults import ConfigurationError
 
 PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
-(SPIRAL,) = (block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block)
+(SPIRAL,) = (
+    block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block
+)
 pytestmark = pytest.mark.usefixtures("own_folder")
 ENDS = """from servobench.harness.run.references import FixedPoint
 class Ends(FixedPoint):
@@ -39,7 +41,9 @@ WRONG = "from servobench import TaskEntry\nENTRY = TaskEntry('wrong', 'a number'
 
 def test_a_task_of_a_file_is_carried_out_with_its_settings_and_recorded(tmp_path):
     write(tmp_path, SPIRAL, "spiral.py")
-    run = servobench.run("ukf_mfac", task="./spiral.py", seed=1, settings={"Spiral": {"duration": 2.0}})
+    run = servobench.run(
+        "ukf_mfac", task="./spiral.py", seed=1, settings={"Spiral": {"duration": 2.0}}
+    )
     assert (run.row["task"], run.row["status"], run.row["periods"]) == ("Spiral", "completed", 40)
     assert run.row["run_id"] == "kinematic-ukf_mfac-Spiral-moderate-1"
     reached = run.steps.filter(regex="^reference_").to_numpy()[-1]
@@ -52,21 +56,40 @@ def test_worker_processes_carry_out_the_same_runs_of_users_code_and_the_manifest
         write(tmp_path, text, name)
     asked = ["b/mine.py", Resting], ["a/cell.py", "kinematic"], ["c/spiral.py", "exp1"]
     settings = {"exp1": {"duration": 0.5}, "Spiral": {"duration": 0.5}}
-    tables = [servobench.compare(*asked, seeds=2, settings=settings, workers=n, out=str(n)) for n in (1, 2)]
+    tables = [
+        servobench.compare(*asked, seeds=2, settings=settings, workers=n, out=str(n))
+        for n in (1, 2)
+    ]
     pd.testing.assert_frame_equal(*map(judged, tables), check_exact=True)
     assert set(tables[0]["status"]) == {"completed"}
     assert (tables[0]["control_effort_rad"] == 0.0).all()
     manifest = json.loads((tmp_path / "2" / "manifest.json").read_text())
     own = {name: record["place"] for kind in ("controllers", "plants", "tasks")
            for name, record in manifest[f"own_{kind}"].items()}  # fmt: skip
-    assert own == {"Mine": "b/mine.py", "Resting": "Resting", "Cell": "a/cell.py", "Spiral": "c/spiral.py"}
+    assert own == {
+        "Mine": "b/mine.py",
+        "Resting": "Resting",
+        "Cell": "a/cell.py",
+        "Spiral": "c/spiral.py",
+    }
     assert "c/spiral.py" in " ".join(manifest["files"])
 
 
-def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(output_of, no_figures, tmp_path, monkeypatch):
+def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(
+    output_of, no_figures, tmp_path, monkeypatch
+):
     write(tmp_path, SPIRAL, "spiral.py")
     assert "Spiral.radius = 0.1" in output_of("tasks", "./spiral.py")
-    options = ("--plants", "kinematic", "--controllers", "constant", "--tasks", "round=./spiral.py", "--out", "runs")
+    options = (
+        "--plants",
+        "kinematic",
+        "--controllers",
+        "constant",
+        "--tasks",
+        "round=./spiral.py",
+        "--out",
+        "runs",
+    )
     options += ("--workers", "1", "--no-report")
     assert command(monkeypatch, "compare", *options, "--set", "round.radius=0.2") == 0
     assert servobench.load("runs").runs["task"].unique().tolist() == ["round"]
@@ -129,8 +152,14 @@ def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, chang
         ("Short", r"the task's reference needs a row for each of 30 times, got \(29, 3\)"),
     ],
 )
-def test_a_reference_without_numbers_beyond_its_end_is_no_fault_of_the_controller(tmp_path, reference, words):
-    write(tmp_path, ENDS + SPIRAL.replace("Waypoints(times, points)", f"{reference}(np.zeros(3))"), "spiral.py")
+def test_a_reference_without_numbers_beyond_its_end_is_no_fault_of_the_controller(
+    tmp_path, reference, words
+):
+    write(
+        tmp_path,
+        ENDS + SPIRAL.replace("Waypoints(times, points)", f"{reference}(np.zeros(3))"),
+        "spiral.py",
+    )
     assert re.search(words, servobench.run("constant", task="./spiral.py").row["reason"])
     request = RunRequest("kinematic", "constant", choose_task("./spiral.py"), "moderate", 0)
     with pytest.raises(ConfigurationError, match=f"task Spiral: {words}"), offering():
@@ -138,7 +167,9 @@ def test_a_reference_without_numbers_beyond_its_end_is_no_fault_of_the_controlle
 
 
 def test_a_task_that_fails_to_make_its_scenario_is_refused_with_its_reason(tmp_path):
-    broken = SPIRAL.replace("        times =", '        raise ValueError("the spiral is too tight")\n        times =')
+    broken = SPIRAL.replace(
+        "        times =", '        raise ValueError("the spiral is too tight")\n        times ='
+    )
     write(tmp_path, broken, "spiral.py")
     with pytest.raises(ConfigurationError, match="task Spiral: the spiral is too tight"):
         servobench.run("constant", task="./spiral.py")
@@ -152,7 +183,9 @@ def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
     try:
         assert find_task("spiral").summary == "A spiral from the middle of the image outwards."
         assert find_task("circle") is TASKS["circle"]
-        with pytest.raises(ConfigurationError, match=r"task 'lost' \(spirals:Lost\) cannot be loaded"):
+        with pytest.raises(
+            ConfigurationError, match=r"task 'lost' \(spirals:Lost\) cannot be loaded"
+        ):
             find_task("lost")
         run = servobench.run("constant", task="spiral")
         assert run.row["status"] == "completed"

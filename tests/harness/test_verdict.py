@@ -10,7 +10,9 @@ from servobench.harness.analysis.verdict import judge, knows_truth, leaders
 def runs_of(seeds: int, **times: float) -> pd.DataFrame:
     """Return moves of controllers that settle after about these times; NaN never settles."""
     rows = [
-        made_up_row(f"{name}-{seed}", controller=name, seed=seed, settling_time_s=time + 0.01 * seed)
+        made_up_row(
+            f"{name}-{seed}", controller=name, seed=seed, settling_time_s=time + 0.01 * seed
+        )
         for name, time in times.items()
         for seed in range(seeds)
     ]
@@ -19,13 +21,17 @@ def runs_of(seeds: int, **times: float) -> pd.DataFrame:
 
 def test_one_run_is_told_as_one_run():
     verdict = judge(runs_of(1, mine=1.5))
-    assert verdict.result.startswith("`mine` settled in exp1 on kinematic after 1.50 s, with an error of 1.0 mm")
+    assert verdict.result.startswith(
+        "`mine` settled in exp1 on kinematic after 1.50 s, with an error of 1.0 mm"
+    )
     assert verdict.cautions == ("One run says nothing about other seeds.",)
 
 
 def test_one_run_that_did_not_succeed_says_what_came_of_it():
     lost = runs_of(1, mine=np.nan).assign(outcome="joint_at_limit")
-    assert judge(lost).result.startswith("`mine` did not settle in exp1 on kinematic (joint_at_limit): it ended with")
+    assert judge(lost).result.startswith(
+        "`mine` did not settle in exp1 on kinematic (joint_at_limit): it ended with"
+    )
     crashed = lost.assign(status="crashed", outcome="crashed")
     assert judge(crashed).result == "`mine` ended exp1 on kinematic early: crashed."
     curve = runs_of(1, mine=np.nan).assign(task_kind="curve", task="circle")
@@ -58,11 +64,26 @@ def test_the_first_sentence_names_the_best_and_by_how_much():
 
 def test_the_first_sentence_names_all_that_are_practically_equal_and_those_that_are_undecided():
     verdict = judge(runs_of(8, a=1.0, b=2.0, c=1.01))
-    assert verdict.result == "`a` and `c` are best: equal within 0.05 s and 1.00 s ahead of `b` in settling time."
+    assert (
+        verdict.result
+        == "`a` and `c` are best: equal within 0.05 s and 1.00 s ahead of `b` in settling time."
+    )
     assert verdict.cautions[0] == "All 3 controllers settled in every run."
     runs = runs_of(8, a=1.0, b=2.0, d=1.0)
-    runs.loc[runs["controller"] == "d", "settling_time_s"] += [0.0, 0.5, 0.0, 0.3, 0.0, 0.0, 0.4, 0.0]
-    assert judge(runs).result == "`a` is first: 1.00 s ahead of `b` in settling time, undecided against `d`."
+    runs.loc[runs["controller"] == "d", "settling_time_s"] += [
+        0.0,
+        0.5,
+        0.0,
+        0.3,
+        0.0,
+        0.0,
+        0.4,
+        0.0,
+    ]
+    assert (
+        judge(runs).result
+        == "`a` is first: 1.00 s ahead of `b` in settling time, undecided against `d`."
+    )
 
 
 def test_places_with_the_same_winners_share_a_clause_and_others_have_their_own():
@@ -84,13 +105,20 @@ def test_where_nothing_differs_nobody_is_first():
 def test_the_least_and_the_most_reliable_are_named_with_their_runs():
     verdict = judge(runs_of(12, good=1.0, bad=np.nan))
     assert verdict.result == "`good` is best, losing fewer runs than `bad`."
-    assert verdict.cautions[0].startswith("`good` settled in 12 of 12 runs (95 % interval: 76 to 100 %)")
+    assert verdict.cautions[0].startswith(
+        "`good` settled in 12 of 12 runs (95 % interval: 76 to 100 %)"
+    )
     assert "least often `bad`, in 0 of 12 runs (95 % interval: 0 to 24 %)." in verdict.cautions[0]
-    assert verdict.cautions[1:] == ("`bad` succeeds significantly less often than `good` (sign test over seeds).",)
+    assert verdict.cautions[1:] == (
+        "`bad` succeeds significantly less often than `good` (sign test over seeds).",
+    )
 
 
 def test_where_nothing_succeeds_nobody_is_praised():
-    assert judge(runs_of(3, a=np.nan, b=np.nan)).result == "None of the 2 controllers settled in any of 6 runs."
+    assert (
+        judge(runs_of(3, a=np.nan, b=np.nan)).result
+        == "None of the 2 controllers settled in any of 6 runs."
+    )
 
 
 def test_a_bound_that_knows_the_truth_is_not_ranked():
@@ -124,7 +152,9 @@ def test_who_came_first_is_told_with_those_that_are_not_shown_to_be_behind():
 
 def test_the_first_by_one_run_is_not_said_to_beat_those_that_are_faster():
     runs = runs_of(30, reliable=2.0, fast=1.0, slow=3.0)
-    runs.loc[(runs["controller"] != "reliable") & (runs["seed"] == 0), ["settling_time_s", "outcome"]] = np.nan, "lost"
+    runs.loc[
+        (runs["controller"] != "reliable") & (runs["seed"] == 0), ["settling_time_s", "outcome"]
+    ] = np.nan, "lost"
     (row,) = leaders(runs).to_dict("records")
     assert (row["First", "controller"], row["Next", "controller"]) == ("reliable", "fast")
     assert row["How sure", "not shown to be behind the first"] == "fast"
@@ -137,7 +167,9 @@ def test_errors_of_different_units_are_in_no_common_range():
     curves = runs_of(8, a=np.nan, b=np.nan).assign(task_kind="curve", task="circle")
     curves.loc[curves["controller"] == "b", "rms_error_evaluated"] *= 3.0
     other = curves.assign(
-        sensing="pixel", feature_unit="px", rms_error_evaluated=1000.0 * curves["rms_error_evaluated"]
+        sensing="pixel",
+        feature_unit="px",
+        rms_error_evaluated=1000.0 * curves["rms_error_evaluated"],
     )
     result = judge(pd.concat([curves.assign(sensing="position"), other])).result
     assert "4.00 mm ahead of `b`" in result
@@ -157,7 +189,10 @@ def test_runs_that_an_unfinished_batch_lacks_are_neither_lost_nor_settled():
     runs = runs_of(10, a=1.0, b=1.0, c=np.nan)
     part = runs[(runs["controller"] != "b") | (runs["seed"] < 4)]
     assert leaders(part)["First", "median"].tolist() == ["1.02 s [1.00, 1.03]"]
-    assert "`a` and `b` each settled in 100 % of runs; least often `c`, in 0 of 10" in judge(part).result
+    assert (
+        "`a` and `b` each settled in 100 % of runs; least often `c`, in 0 of 10"
+        in judge(part).result
+    )
 
 
 def test_one_controller_has_a_median_in_one_place_only_and_keeps_its_name():

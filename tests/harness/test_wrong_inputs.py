@@ -337,11 +337,36 @@ SETUPS = (  # file, its second feature, the name of its third, unit
 )
 UNLIKELY = (  # task, its settings, sensing, message
     ("circle", {"lap_time": 0.5}, "position", "the reference of the task circle moves at 3.7"),
-    ("waypoints", {"file": "fast.csv"}, "position", "the reference of the task waypoints moves at 6 m/s"),
-    ("waypoints", {"file": "slow.csv"}, "position", "slow.csv take 6002 s; time_s is in s, not in ms"),
-    ("target", {"target": [0.0, 0.5, 1.3]}, "position", "a target 160 mm from the arm's shoulder is within the arm"),
-    ("exp2", {}, "./still.py", "sensing ./still.py: a feature stands still, or moves as another one does"),
-    ("exp2", {}, "./double.py", "sensing ./double.py: a feature stands still, or moves as another one does"),
+    (
+        "waypoints",
+        {"file": "fast.csv"},
+        "position",
+        "the reference of the task waypoints moves at 6 m/s",
+    ),
+    (
+        "waypoints",
+        {"file": "slow.csv"},
+        "position",
+        "slow.csv take 6002 s; time_s is in s, not in ms",
+    ),
+    (
+        "target",
+        {"target": [0.0, 0.5, 1.3]},
+        "position",
+        "a target 160 mm from the arm's shoulder is within the arm",
+    ),
+    (
+        "exp2",
+        {},
+        "./still.py",
+        "sensing ./still.py: a feature stands still, or moves as another one does",
+    ),
+    (
+        "exp2",
+        {},
+        "./double.py",
+        "sensing ./double.py: a feature stands still, or moves as another one does",
+    ),
     ("exp2", {}, "./mm.py", "mm/rad; is mm their unit?"),
     ("exp2", {}, "./thousands.py", "m/rad; is m their unit?"),
 )
@@ -366,7 +391,9 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
+@pytest.mark.parametrize(
+    ("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG]
+)
 def test_a_wrong_input_is_one_right_line(place, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(place)
     before = contents(place)
@@ -379,11 +406,16 @@ def test_a_wrong_input_is_one_right_line(place, monkeypatch, capsys, arguments, 
 
 
 @pytest.mark.parametrize(("task", "settings", "sensing", "words"), UNLIKELY)
-def test_an_unlikely_input_is_remarked_on_and_runs(place, monkeypatch, caplog, task, settings, sensing, words):
+def test_an_unlikely_input_is_remarked_on_and_runs(
+    place, monkeypatch, caplog, task, settings, sensing, words
+):
     monkeypatch.chdir(place)
     remark.cache_clear()
     build_once(
-        resolve(RunRequest("kinematic", "constant", task, "none", 0, sensing=sensing), Settings({task: settings}))
+        resolve(
+            RunRequest("kinematic", "constant", task, "none", 0, sensing=sensing),
+            Settings({task: settings}),
+        )
     )
     assert words in caplog.text
 
@@ -392,7 +424,9 @@ def test_an_unlikely_input_is_remarked_on_and_runs(place, monkeypatch, caplog, t
 @pytest.mark.parametrize("sensing", ["position", "pixel", "stereo:hand"])
 def test_a_task_as_it_comes_is_not_remarked_on(caplog, task, sensing):
     remark.cache_clear()
-    build_once(resolve(RunRequest("kinematic", "constant", task, "severe", 0, sensing=sensing), Settings()))
+    build_once(
+        resolve(RunRequest("kinematic", "constant", task, "severe", 0, sensing=sensing), Settings())
+    )
     assert not caplog.text
 
 
@@ -423,7 +457,9 @@ def test_a_setting_that_waits_for_another_is_remarked_on(
     assert words in caplog.text if words else not caplog.text
 
 
-def test_a_set_up_whose_features_share_a_name_is_refused_with_its_line(refusal_of, place, monkeypatch):
+def test_a_set_up_whose_features_share_a_name_is_refused_with_its_line(
+    refusal_of, place, monkeypatch
+):
     monkeypatch.chdir(place)
     line = refusal_of(*RUN, "--sensing", "./named_twice.py")
     assert "named_twice.py:9: ValueError: each joint and feature needs a name of its own" in line

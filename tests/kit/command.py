@@ -39,10 +39,14 @@ def start(*arguments: str, path: Path = PACKAGE, **environment: str) -> subproce
 
 def carried_out(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """Return how a command ended, with what it wrote to standard output and error."""
-    return subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **options)
+    return subprocess.run(
+        [*map(str, words)], capture_output=True, text=True, check=False, **options
+    )
 
 
-def python(*words: object, path: Path = PACKAGE, **environment: str) -> subprocess.CompletedProcess[str]:
+def python(
+    *words: object, path: Path = PACKAGE, **environment: str
+) -> subprocess.CompletedProcess[str]:
     """Return how Python ended with arguments in the folder `path`, which is searched for packages, too."""
     own = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{path}", **environment}
     return carried_out(sys.executable, *words, cwd=path, env=own, timeout=900)
@@ -83,7 +87,9 @@ def part_count(folder: Path) -> int:
 def no_file_above(size: int) -> Iterator[None]:
     """Let each write beyond a size [bytes] of a file fail, as beyond a quota or on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with pytest.MonkeyPatch.context() as patch:  # Python before 3.13.1 keeps a compiled module that was cut short
+    with (
+        pytest.MonkeyPatch.context() as patch
+    ):  # Python before 3.13.1 keeps a compiled module that was cut short
         patch.setattr(sys, "dont_write_bytecode", True)
         patch.setenv("PYTHONDONTWRITEBYTECODE", "1")
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
@@ -95,4 +101,6 @@ def no_file_above(size: int) -> Iterator[None]:
 
 def judged(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table without the wall-clock times, which differ between two runs of the same seed."""
-    return table[[name for name in table.columns if not name.startswith(("controller_time", "plant_time"))]]
+    return table[
+        [name for name in table.columns if not name.startswith(("controller_time", "plant_time"))]
+    ]

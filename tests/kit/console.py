@@ -8,14 +8,17 @@ from pathlib import Path
 from kit.command import servobench
 from kit.documents import FENCED
 
-BLOCK = re.compile(rf"{FENCED.pattern}|(?<=\n\n)((?: {{4}}[^\n]*\n)+)", FENCED.flags)  # fenced, or indented
-PASTED = re.compile(r" {4}(servobench|pip|python3?|for) ")  # an indented block that goes into a shell
+# Fenced, or indented
+BLOCK = re.compile(rf"{FENCED.pattern}|(?<=\n\n)((?: {{4}}[^\n]*\n)+)", FENCED.flags)
+# An indented block that goes into a shell
+PASTED = re.compile(r" {4}(servobench|pip|python3?|for) ")
 SAVED = re.compile(r"`([\w/-]+\.\w+)`:\s*$")  # the line before a block that is a file
 ELLIPSIS = "..."
 PROGRESS = re.compile(r"^(running|training)\b.*[━╸]|^report: ")  # times and sizes differ
 VARYING = re.compile(r" \* some steps took longer than the period|\d+ (?=figures)")  # 1: when busy
 SLOW = re.compile(r"^note +time .*longer than the period.*$")  # of a check, when busy
-CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")  # the last column of a table of runs: microseconds of wall clock
+# The last column of a table of runs: microseconds of wall clock
+CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")
 
 
 def steps(text):
@@ -93,10 +96,14 @@ def compare(command, told, printed):
             where = None
             continue
         if where is None:
-            assert line in printed, f"{command} does not print {line!r}, but:\n" + "\n".join(printed)
+            assert line in printed, f"{command} does not print {line!r}, but:\n" + "\n".join(
+                printed
+            )
             where = printed.index(line)
         assert where < len(printed), f"{command} ends before {line!r}"
-        assert printed[where] == line, f"{command} prints {printed[where]!r}, the page says {line!r}"
+        assert printed[where] == line, (
+            f"{command} prints {printed[where]!r}, the page says {line!r}"
+        )
         where += 1
     if told and told[-1] != ELLIPSIS:
         assert where == len(printed), f"{command} also prints {printed[where:]}"

@@ -8,7 +8,15 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "fmus/README.md", "fmus/ur5_mismatched/readme.md")),
+    *(
+        ROOT / name
+        for name in (
+            "README.md",
+            "CONTRIBUTING.md",
+            "fmus/README.md",
+            "fmus/ur5_mismatched/readme.md",
+        )
+    ),
     *DOCS,
 ]
 FENCED = re.compile(r"^```([\w{}]*)[^`\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -27,8 +35,12 @@ def blocks(text, language):
 def section(text, heading):
     """What follows a heading, up to the next one of its level or above."""
     level = len(re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE)[1])
-    rest = FENCED.sub(lambda match: match[0].replace("\n#", "\n\0"), text).split(f"\n{'#' * level} {heading}\n", 1)[1]
-    return re.split(rf"^#{{1,{level}}} ", rest, maxsplit=1, flags=re.MULTILINE)[0].replace("\0", "#")
+    rest = FENCED.sub(lambda match: match[0].replace("\n#", "\n\0"), text).split(
+        f"\n{'#' * level} {heading}\n", 1
+    )[1]
+    return re.split(rf"^#{{1,{level}}} ", rest, maxsplit=1, flags=re.MULTILINE)[0].replace(
+        "\0", "#"
+    )
 
 
 def tables(text):
@@ -61,7 +73,9 @@ def find(path, name):
     assert (ROOT / path).is_file(), path
     if path.startswith("tests/"):
         tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-        return next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name)
+        return next(
+            node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name
+        )
     found = importlib.import_module("servobench." + path.removesuffix(".py").replace("/", "."))
     for part in name.split("."):
         found = getattr(found, part)

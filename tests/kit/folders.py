@@ -10,7 +10,11 @@ from servobench.harness.batch import results
 from servobench.plant.contract.checksums import write_vouched
 
 CONTROLLERS = ("rbfnn_mfac", "ukf_mfac", "someone_elses")
-MANIFEST = {"created": "2026-01-01T00:00:00+00:00", "packages": {"servobench": "0.1.0"}, "python": "3.11.0"}
+MANIFEST = {
+    "created": "2026-01-01T00:00:00+00:00",
+    "packages": {"servobench": "0.1.0"},
+    "python": "3.11.0",
+}
 
 
 def made_up_steps(
@@ -66,7 +70,11 @@ def comparison(folder: Path, controllers=CONTROLLERS, tasks=("exp1", "exp2", "ci
         for controller in controllers:
             run_id = re.sub(r"[^\w.-]", "_", f"kinematic-{controller}-{task}-moderate-0")
             curve = task == "circle"
-            judged = {"overshoot": np.nan, "settling_time_s": np.nan, "task_kind": "curve"} if curve else {}
+            judged = (
+                {"overshoot": np.nan, "settling_time_s": np.nan, "task_kind": "curve"}
+                if curve
+                else {}
+            )
             rows.append(made_up_row(run_id, controller=controller, task=task, **judged))
             steps.append(made_up_steps(run_id, curve=curve))
     return write_folder(folder, rows, steps)
@@ -95,4 +103,8 @@ def failed_only(folder: Path) -> Path:
     """Write a folder whose runs all ended before their first period."""
     keys = ("run_id", "plant", "controller", "task", "seed", "mismatch", "mismatch_values")
     row = {key: made_up_row("kinematic-ukf_mfac-exp1-moderate-0")[key] for key in keys}
-    return write_folder(folder, [row | {"status": "crashed", "periods": 0, "reason": "ValueError: no such thing"}], [])
+    return write_folder(
+        folder,
+        [row | {"status": "crashed", "periods": 0, "reason": "ValueError: no such thing"}],
+        [],
+    )

@@ -26,7 +26,12 @@ ROLES = {  # names of variables by role, of each version
     }
     for version, parts in ((2, (".slew", ".luff")), (3, ("",)))
 }
-SCALARS = [("wheel", 10, "output"), ("push", 20, "input"), ("place", 30, "output"), ("arm", 40, "parameter")]
+SCALARS = [
+    ("wheel", 10, "output"),
+    ("push", 20, "input"),
+    ("place", 30, "output"),
+    ("arm", 40, "parameter"),
+]
 
 
 def describe_exchange(derivatives: bool = True) -> str:
@@ -34,7 +39,8 @@ def describe_exchange(derivatives: bool = True) -> str:
     text = describe(2)
     names = ("wheel.slew", "wheel.luff")
     rates = "".join(
-        _scalar(f"der({name})", 60 + i, "", f'<Real derivative="{i + 1}"/>') for i, name in enumerate(names)
+        _scalar(f"der({name})", 60 + i, "", f'<Real derivative="{i + 1}"/>')
+        for i, name in enumerate(names)
     )
     first = text.count("<ScalarVariable") + 1
     outputs, rows = "".join(map(_unknown, (1, 2, 5, 6))), "".join(map(_unknown, (first, first + 1)))
@@ -51,7 +57,11 @@ def describe_exchange(derivatives: bool = True) -> str:
 def mapping(version: int) -> str:
     """Return the mapping of `crane.fmu` in TOML."""
     return "\n".join(
-        ['file = "crane.fmu"', *(f"{role} = {json.dumps(names)}" for role, names in ROLES[version].items()), ""]
+        [
+            'file = "crane.fmu"',
+            *(f"{role} = {json.dumps(names)}" for role, names in ROLES[version].items()),
+            "",
+        ]
     )
 
 
@@ -80,9 +90,14 @@ def describe(version: int) -> str:
         else:
             reals = [f'<Real start="{start}"/>' for start in starts] if starts else ["<Real/>"] * 2
             parts = zip(("slew", "luff"), reals, strict=True)
-            rows += [_scalar(f"{name}.{part}", reference + i, common, real) for i, (part, real) in enumerate(parts)]
+            rows += [
+                _scalar(f"{name}.{part}", reference + i, common, real)
+                for i, (part, real) in enumerate(parts)
+            ]
     if version == 3:
-        rows.append('<Float64 name="quirk" valueReference="50" causality="parameter" variability="tunable" start="0"/>')
+        rows.append(
+            '<Float64 name="quirk" valueReference="50" causality="parameter" variability="tunable" start="0"/>'
+        )
         rows.append(
             '<UInt64 name="size" valueReference="60" causality="structuralParameter" variability="fixed" start="2"/>'
         )
@@ -98,7 +113,9 @@ def describe(version: int) -> str:
         ]
         head = 'fmiVersion="3.0" modelName="Crane" instantiationToken="x"'
     else:
-        tunable, fixed = (f'causality="parameter" variability="{word}"' for word in ("tunable", "fixed"))
+        tunable, fixed = (
+            f'causality="parameter" variability="{word}"' for word in ("tunable", "fixed")
+        )
         rows += [
             _scalar("quirk", 50, tunable, '<Real start="0"/>'),
             _scalar("gear", 70, tunable, '<Integer start="1"/>'),
@@ -123,18 +140,30 @@ def describe_with(version: int, old: str, new: str) -> str:
 def library(version: int, name: str = "crane") -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / f"{name}.so"
-        arguments = ["-shared", "-fPIC", "-O1", str(SOURCES / f"{name}{version}.c"), "-o", str(target), "-lm"]
+        arguments = [
+            "-shared",
+            "-fPIC",
+            "-O1",
+            str(SOURCES / f"{name}{version}.c"),
+            "-o",
+            str(target),
+            "-lm",
+        ]
         subprocess.run([shutil.which("cc") or "gcc", *arguments], check=True)
         return target.read_bytes()
 
 
-def build_crane(path: Path, version: int, *, folder: str | None = None, description: str | None = None) -> Path:
+def build_crane(
+    path: Path, version: int, *, folder: str | None = None, description: str | None = None
+) -> Path:
     """Write the foreign FMU to `path`."""
     place = folder or this_platform().folder(version)
     with zipfile.ZipFile(path, "w") as archive:
         # Without the time: equal content is unpacked once.
         archive.writestr(zipfile.ZipInfo("modelDescription.xml"), description or describe(version))
-        archive.writestr(zipfile.ZipInfo(f"binaries/{place}/crane{this_platform().suffix}"), library(version))
+        archive.writestr(
+            zipfile.ZipInfo(f"binaries/{place}/crane{this_platform().suffix}"), library(version)
+        )
     return path
 
 
@@ -143,10 +172,18 @@ def build_pilot(path: Path) -> Path:
     reals = [(f"{name}.{part}", causality) for name, causality in
              (("goal", "input"), ("hook", "input"), ("angle", "input"), ("rate", "output"))
              for part in ("slew", "luff")]  # fmt: skip
-    rows = [_scalar(name, k, f'causality="{causality}"', "<Real/>") for k, (name, causality) in enumerate(reals)]
-    rows.append(_scalar("gain", 8, 'causality="parameter" variability="tunable"', '<Real start="2"/>'))
+    rows = [
+        _scalar(name, k, f'causality="{causality}"', "<Real/>")
+        for k, (name, causality) in enumerate(reals)
+    ]
+    rows.append(
+        _scalar("gain", 8, 'causality="parameter" variability="tunable"', '<Real start="2"/>')
+    )
     discrete = 'causality="input" variability="discrete"'
-    rows += [_scalar(f"clear.{part}", 20 + k, discrete, "<Boolean/>") for k, part in enumerate(("slew", "luff"))]
+    rows += [
+        _scalar(f"clear.{part}", 20 + k, discrete, "<Boolean/>")
+        for k, part in enumerate(("slew", "luff"))
+    ]
     description = (
         '<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="Pilot" guid="y">'
         f'<CoSimulation modelIdentifier="pilot"/><ModelVariables>{"".join(rows)}</ModelVariables>'

@@ -8,7 +8,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 CONTEXT = get_context("forkserver")
-CONTEXT.set_forkserver_preload(["servobench.harness.batch.campaign", "servobench.harness.run.episode"])
+CONTEXT.set_forkserver_preload(
+    ["servobench.harness.batch.campaign", "servobench.harness.run.episode"]
+)
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,9 @@ class Done:
 def servobench_without(blocked, arguments, folder: Path, **environment: str) -> Done:
     """Run `servobench` with arguments in a folder of its own process, which cannot import what is blocked."""
     streams = [folder.with_name(folder.name + end) for end in (".out", ".err")]
-    process = CONTEXT.Process(target=_call, args=(tuple(blocked), arguments, folder, streams, environment))
+    process = CONTEXT.Process(
+        target=_call, args=(tuple(blocked), arguments, folder, streams, environment)
+    )
     # Where a test of Gymnasium ran before, the process would inherit its environment, and import it.
     process._config.pop("servobench/Servo-v0", None)
     process.start()

@@ -27,7 +27,8 @@ from servobench.harness.run.tasks import find_task
 PERIODS = 20  # that are compared
 PERIOD = 0.05  # [s]
 TASK = "exp2"
-DURATIONS = {"kinematic": 4.0, "fmu": 4.0, **dict.fromkeys(RENDERED, PERIODS * PERIOD)}  # [s], short where rendered
+# [s], short where rendered
+DURATIONS = {"kinematic": 4.0, "fmu": 4.0, **dict.fromkeys(RENDERED, PERIODS * PERIOD)}
 ALL_RUNS = dict.fromkeys(DURATIONS, CONTROLLERS)  # methods by plant
 RENDERER = "llvmpipe"  # that drew the images of `mujoco`; those of another one differ by more than rounding
 MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow command
@@ -35,7 +36,8 @@ TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
 SUMS = [f"u{k:02d}" for k in range(PERIODS)]
 SIMD = "NPY_DISABLE_CPU_FEATURES"  # loops of numpy that are not used, by the names in `numpy.show_config()`
 AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
-KERNEL = {"OPENBLAS_CORETYPE": "Haswell", SIMD: AVX512}  # of the table: AVX2, which x86-64 processors have since 2015
+# of the table: AVX2, which x86-64 processors have since 2015
+KERNEL = {"OPENBLAS_CORETYPE": "Haswell", SIMD: AVX512}
 OTHER_KERNELS = ("Sandybridge", "Nehalem")
 VARIANTS: tuple[Mapping[str, str], ...] = (
     *({"OPENBLAS_CORETYPE": kernel} for kernel in OTHER_KERNELS),
@@ -46,7 +48,10 @@ VARIANTS: tuple[Mapping[str, str], ...] = (
 
 def golden_runs(plant: str, controllers: Sequence[str]) -> pd.DataFrame:
     """Make the runs on a plant and return the rows of the table, without the spread."""
-    settings: dict[str, dict[str, Any]] = {TASK: {"duration": DURATIONS[plant]}, "run": {"period": PERIOD}}
+    settings: dict[str, dict[str, Any]] = {
+        TASK: {"duration": DURATIONS[plant]},
+        "run": {"period": PERIOD},
+    }
     if plant in RENDERED:
         settings[plant] = {"scenery": False}  # which changes no bit of an observation
     if os.environ.get("GOLDEN_START") == "next":
@@ -62,7 +67,9 @@ def golden_runs(plant: str, controllers: Sequence[str]) -> pd.DataFrame:
         u = steps.filter(like="joint_velocity_command_").to_numpy()[:PERIODS]
         values = [float(f"{value:.15g}") for value in u @ np.arange(1.0, u.shape[1] + 1.0)]
         sums = dict(zip(SUMS, values, strict=True))
-        rows.append({"plant": plant, "controller": run.controller, "settled": run.settling_time_s, **sums})
+        rows.append(
+            {"plant": plant, "controller": run.controller, "settled": run.settling_time_s, **sums}
+        )
     return pd.DataFrame(rows)
 
 
@@ -76,7 +83,9 @@ def changelog_line() -> str:
     return f"Golden runs: `{hashlib.sha256(TABLE.read_bytes()).hexdigest()[:16]}`."
 
 
-def made_apart(folder: Path, controllers: Mapping[str, Iterable[str]] = ALL_RUNS, **environment: str) -> pd.DataFrame:
+def made_apart(
+    folder: Path, controllers: Mapping[str, Iterable[str]] = ALL_RUNS, **environment: str
+) -> pd.DataFrame:
     """Return the table as a process of its own makes it, by the plants; the first one in a folder trains networks."""
     folder.mkdir(exist_ok=True)
     path = folder / "made.csv"
@@ -108,6 +117,8 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         path, *runs = sys.argv[1:]
         wanted = [each.partition("=") for each in runs]
-        pd.concat([golden_runs(plant, names.split(",")) for plant, _, names in wanted]).to_csv(path, index=False)
+        pd.concat([golden_runs(plant, names.split(",")) for plant, _, names in wanted]).to_csv(
+            path, index=False
+        )
     else:
         renew()

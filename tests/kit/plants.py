@@ -16,16 +16,22 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, ur5_arm
 
 NEEDS_BULLET = pytest.mark.skipif(
-    find_spec("pybullet") is None, reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
+    find_spec("pybullet") is None,
+    reason="PyBullet is not installed; from Python 3.12 on it has no wheel",
 )
 
-NEEDS_MUJOCO = pytest.mark.skipif(find_spec("mujoco") is None, reason="the extra mujoco is not installed")
+NEEDS_MUJOCO = pytest.mark.skipif(
+    find_spec("mujoco") is None, reason="the extra mujoco is not installed"
+)
 NEEDS = {"bullet": NEEDS_BULLET, "mujoco": NEEDS_MUJOCO}
 
 
 def plant_parameters(names):
     """Return names of plants as parameters of a test; rendered ones are slow, and skipped where they cannot run."""
-    return [pytest.param(name, marks=[NEEDS[name], pytest.mark.slow]) if name in NEEDS else name for name in names]
+    return [
+        pytest.param(name, marks=[NEEDS[name], pytest.mark.slow]) if name in NEEDS else name
+        for name in names
+    ]
 
 
 ALL_PLANTS = plant_parameters(plant_names())
@@ -68,6 +74,8 @@ def configure(kind, **values):
     """Return settings of class `kind` from flat keywords; those of the section `sensing` are sorted into it."""
     default = kind()
     names = {field.name for field in fields(SensingConfig)}
-    sensing = replace(default.sensing, **{name: value for name, value in values.items() if name in names})
+    sensing = replace(
+        default.sensing, **{name: value for name, value in values.items() if name in names}
+    )
     rest = {name: value for name, value in values.items() if name not in names}
     return replace(default, sensing=sensing, **rest)

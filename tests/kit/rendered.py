@@ -44,5 +44,10 @@ def wiggle(plant, seed, periods=12) -> np.ndarray:
 
 def geared_ur5() -> HandEyeModel:
     arm = ur5.ur5_arm()
-    gear, offset = np.array([1.1, 0.9, 1.05, 0.95, -1.0, 1.0]), np.array([0.05, -0.05, 0.02, 0.0, 0.1, -0.1])
-    return HandEyeModel(SerialArm(arm.joint_names, arm.translation, arm.rpy, offset, gear, arm.tool), MODEL.X_BC)
+    gear, offset = (
+        np.array([1.1, 0.9, 1.05, 0.95, -1.0, 1.0]),
+        np.array([0.05, -0.05, 0.02, 0.0, 0.1, -0.1]),
+    )
+    return HandEyeModel(
+        SerialArm(arm.joint_names, arm.translation, arm.rpy, offset, gear, arm.tool), MODEL.X_BC
+    )

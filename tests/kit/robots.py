@@ -81,4 +81,6 @@ def arm_joints(n, prefix="", root="base"):
     """Return n rotating joints one after another as `urdf_of` takes them; joint i leads to link i."""
     links = [root, *(f"{prefix}link_{i}" for i in range(1, n + 1))]
     place = '<origin xyz="0 0.1 0.2"/>'
-    return [(f"{prefix}joint_{i}", "revolute", links[i - 1], links[i], place) for i in range(1, n + 1)]
+    return [
+        (f"{prefix}joint_{i}", "revolute", links[i - 1], links[i], place) for i in range(1, n + 1)
+    ]

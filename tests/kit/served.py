@@ -15,10 +15,8 @@ from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.serve.server import PORTS, Server
 
 REQUEST = RunRequest("kinematic", "constant", "target", read_mismatch("moderate"), 0, robot="ur5e")
-SPEED = (
-    "input_int_register_0",
-    *(f"input_double_register_{k}" for k in range(8)),
-)  # of speedJ, speedStop and moveJ, as ur-rtde has them
+# of speedJ, speedStop and moveJ, as ur-rtde has them
+SPEED = ("input_int_register_0", *(f"input_double_register_{k}" for k in range(8)))
 _numbers = itertools.count()
 
 
@@ -86,12 +84,18 @@ def packed(kind, body=b""):
 class Bytes:
     """A client of RTDE: what it sends is what a test says."""
 
-    def __init__(self, address, outputs="timestamp,output_int_register_0,robot_status_bits,safety_status_bits"):
+    def __init__(
+        self,
+        address,
+        outputs="timestamp,output_int_register_0,robot_status_bits,safety_status_bits",
+    ):
         self.socket = connected(address, "RTDE")
         self.stream = self.socket.makefile("rb")
         self.names = outputs.split(",")
         assert self.asked("V", b"\x00\x02") == b"\x01"
-        self.types = self.asked("O", struct.pack(">d", 500.0) + outputs.encode())[1:].decode().split(",")
+        self.types = (
+            self.asked("O", struct.pack(">d", 500.0) + outputs.encode())[1:].decode().split(",")
+        )
 
     def asked(self, kind, body=b""):
         """Return the answer to a packet; data that come before it are left out."""

@@ -12,7 +12,14 @@ from servobench.fmus.compiler import this_platform
 
 MAPPING = 'file = "stub.fmu"\ninputs = ["u"]\njoints = ["q"]\nfeatures = ["y"]\n'
 TARGET = ("--task", "target", "--set", "target.target=[0.1,0.75]")
-PROBES = ("--mismatch", "none", "--set", "ukf_mfac.initial.source=probe", "--set", "ukf_mfac.aids.posture=false")
+PROBES = (
+    "--mismatch",
+    "none",
+    "--set",
+    "ukf_mfac.initial.source=probe",
+    "--set",
+    "ukf_mfac.aids.posture=false",
+)
 START = ' start="0"'
 CAUSES = {"q": "output", "u": "input", "y": "output"}
 
@@ -40,16 +47,24 @@ def library(*macros: str) -> bytes:
         target = Path(folder) / "stub.so"
         options = ["-shared", "-fPIC", "-O1", "-w", *(f"-D{macro}" for macro in macros), "-lm"]
         source = str(SOURCES / "stub2.c")
-        subprocess.run([shutil.which("cc") or "gcc", source, *options, "-o", str(target)], check=True)
+        subprocess.run(
+            [shutil.which("cc") or "gcc", source, *options, "-o", str(target)], check=True
+        )
         return target.read_bytes()
 
 
 def build_stub(
-    folder: Path, *macros: str, description: str = "", separator: str = "/", files: tuple[str, ...] = ()
+    folder: Path,
+    *macros: str,
+    description: str = "",
+    separator: str = "/",
+    files: tuple[str, ...] = (),
 ) -> Path:
     """Write `stub.fmu` and its mapping into a folder, and return the place of the mapping."""
     names = {"modelDescription.xml": (description or describe()).encode()}
-    names[separator.join(("binaries", this_platform().folder(2), f"stub{this_platform().suffix}"))] = library(*macros)
+    names[
+        separator.join(("binaries", this_platform().folder(2), f"stub{this_platform().suffix}"))
+    ] = library(*macros)
     names |= {separator.join(("resources", name)): b"1" for name in files}
     with zipfile.ZipFile(folder / "stub.fmu", "w") as archive:
         for name, content in names.items():

@@ -11,7 +11,11 @@ from scipy.spatial.transform import Rotation
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from servobench.controllers.networks.config import (
+    ControllerTraining,
+    JacobianTraining,
+    TrainingConfig,
+)
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features
 from servobench.controllers.stages.finish import Finish
@@ -30,7 +34,9 @@ TRAINING = TrainingConfig(  # of the smallest networks of a plant of two joints
 def plant_spec(n, m, speed=1.0, reach=6.0):
     """Return a plant of which all joints have the same limits: speed, rad/s, and reach, rad."""
     names = (tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("j", n), ("y", m)))
-    return PlantSpec.of_joints(*names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), PERIOD)
+    return PlantSpec.of_joints(
+        *names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), PERIOD
+    )
 
 
 def seen(q, y, valid=True, k=0):
@@ -41,7 +47,13 @@ def seen(q, y, valid=True, k=0):
 def motion(dq, dy, e=None, q=None, duration=PERIOD):
     """Return a motion of the joints by dq and of the feature by dy."""
     dq, dy = np.asarray(dq, dtype=float), np.asarray(dy, dtype=float)
-    return Motion(np.zeros(dq.size) if q is None else q, dq, dy, np.zeros(dy.size) if e is None else e, duration)
+    return Motion(
+        np.zeros(dq.size) if q is None else q,
+        dq,
+        dy,
+        np.zeros(dy.size) if e is None else e,
+        duration,
+    )
 
 
 class Recorded(NamedTuple):
@@ -85,7 +97,9 @@ class Learning:
 
 def jacobian_features(q, centres, widths):
     """Return the hidden layers θ of all joint columns by the plain formula, (..., n, L), at q, (..., n), rad."""
-    layers = [hidden_features(q, *column, "gaussian") for column in zip(centres, widths, strict=True)]
+    layers = [
+        hidden_features(q, *column, "gaussian") for column in zip(centres, widths, strict=True)
+    ]
     return np.stack(layers, axis=-2)
 
 
@@ -100,7 +114,9 @@ def planar_jacobian(q):
     """Return that of the tip of a planar arm with two or three links, of 0.5, 0.4 and 0.3 m."""
     lengths, angle = np.array([0.5, 0.4, 0.3])[: q.shape[-1]], np.cumsum(q, axis=-1)
     x, y = lengths * np.sin(angle), lengths * np.cos(angle)
-    return np.stack([np.stack([-x[..., i:].sum(-1), y[..., i:].sum(-1)], -1) for i in range(len(lengths))], -1)
+    return np.stack(
+        [np.stack([-x[..., i:].sum(-1), y[..., i:].sum(-1)], -1) for i in range(len(lengths))], -1
+    )
 
 
 TURN = Rotation.from_rotvec(np.radians(120.0) * np.array([0.36, 0.48, 0.8])).as_matrix()
@@ -111,7 +127,11 @@ NETWORK = dataclasses.replace(NETWORK, weights=0.3 * NETWORK.weights)
 def path(duration, period=PERIOD, seed=1):
     """Return joint positions, rad, of an arm that speeds up, turns and brakes, at the begin of each period."""
     rng, t = np.random.default_rng(seed), period * np.arange(round(duration / period))[:, None]
-    speed = 0.8 * np.sin(2 * np.pi * t / rng.uniform(0.75, 2.0, N) + rng.uniform(0.0, 6.0, N)) * np.minimum(1, t / 0.15)
+    speed = (
+        0.8
+        * np.sin(2 * np.pi * t / rng.uniform(0.75, 2.0, N) + rng.uniform(0.0, 6.0, N))
+        * np.minimum(1, t / 0.15)
+    )
     return np.concatenate([np.zeros((1, N)), np.cumsum(period * speed, axis=0)])
 
 
@@ -153,11 +173,15 @@ def networks():
     """Networks as after training within ±2 rad: units so wide that Ĵ_net = A everywhere; any controller network."""
     rng = np.random.default_rng(2)
     centres = np.broadcast_to(np.array([[-2.0], [2.0]]), (N, 2, N))
-    jacobian = JacobianNetwork(centres, np.full((N, 2), 1e9), np.repeat(A.T[:, :, None] / 2.0, 2, axis=2))
+    jacobian = JacobianNetwork(
+        centres, np.full((N, 2), 1e9), np.repeat(A.T[:, :, None] / 2.0, 2, axis=2)
+    )
     centres = rng.normal(size=(8, M + N))
     weights = 0.02 * rng.normal(size=(N, M + N, 8))
     weights[:, M:] += np.eye(N)[:, :, None] / 8
-    return TrainedNetworks(jacobian, ControllerNetwork(centres, np.full(8, 3.0), weights, 1, 1), 0.0, 0.0, "")
+    return TrainedNetworks(
+        jacobian, ControllerNetwork(centres, np.full(8, 3.0), weights, 1, 1), 0.0, 0.0, ""
+    )
 
 
 def only_jacobian(network):
@@ -182,8 +206,14 @@ class Commanding:
         state, wanted = self.law.command(self.state, estimate, observation, reference)
         u = wanted
         if self.finish:
-            forward = reference[..., 1, :] - reference[..., 0, :] if self.aids.feedforward else np.zeros(())
-            u, self.limited = self.finish.finish(wanted, estimate.jacobian, observation.joint_position, forward)
+            forward = (
+                reference[..., 1, :] - reference[..., 0, :]
+                if self.aids.feedforward
+                else np.zeros(())
+            )
+            u, self.limited = self.finish.finish(
+                wanted, estimate.jacobian, observation.joint_position, forward
+            )
             u = self.law.restrained(state, wanted, u)
         self.state = self.law.noted(state, u, self.limited)
         return u

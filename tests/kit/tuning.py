@@ -7,7 +7,12 @@ import numpy as np
 from servobench.harness.batch.blocks import open_workers
 from servobench.harness.config.settings import flatten
 from servobench.harness.studies.tuning import objective as scoring
-from servobench.harness.studies.tuning.campaign import TunedValues, TuningPlan, advance, open_methods
+from servobench.harness.studies.tuning.campaign import (
+    TunedValues,
+    TuningPlan,
+    advance,
+    open_methods,
+)
 from servobench.harness.studies.tuning.objective import TuningSet
 from servobench.harness.studies.tuning.spaces import StudyRecord
 
@@ -31,7 +36,9 @@ def carried_out(folder, plan, workers=1):
 
 def outcomes(folder, plan, workers=1):
     """Carry a plan out and return what each study of each method found."""
-    return [[each.outcome for each in method.studies] for method in carried_out(folder, plan, workers)]
+    return [
+        [each.outcome for each in method.studies] for method in carried_out(folder, plan, workers)
+    ]
 
 
 def cost_by_formula(monkeypatch):

@@ -7,10 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
-TARGETS = {"os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)}  # arguments that are written, by event
-TARGETS |= dict.fromkeys(("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod", "shutil.rmtree"), (0,))
+# Arguments that are written, by event
+TARGETS = {"os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)}
+TARGETS |= dict.fromkeys(
+    ("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod", "shutil.rmtree"), (0,)
+)
 RELATIVE = ("os.mkdir", "os.remove", "os.rmdir", "os.rename")
-OWN_PROGRAMS = ("git", "fc-list", "uname")  # which servobench, matplotlib and the platform module start
+# Which servobench, matplotlib and the platform module start
+OWN_PROGRAMS = ("git", "fc-list", "uname")
 PROGRAMS = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen")
 _notes: list[list[tuple[str, str]]] = []  # the list of the moment: a hook cannot be taken away
 
@@ -23,7 +27,8 @@ def _note(event: str, arguments: tuple[object, ...]) -> None:
         if isinstance(path, str | bytes) and (set(str(mode)) & set("wax+") or int(flags) & WRITING):
             _notes[-1].append((event, os.path.realpath(os.fsdecode(path))))
     elif event in TARGETS:
-        at = arguments[-1] if event in RELATIVE else -1  # a descriptor of the folder from which paths count
+        # A descriptor of the folder from which paths count
+        at = arguments[-1] if event in RELATIVE else -1
         base = Path(f"/proc/self/fd/{at}" if isinstance(at, int) and at >= 0 else "")
         for given in (arguments[index] for index in TARGETS[event]):
             if not isinstance(given, int):  # an open file was noted when it was opened

@@ -50,9 +50,17 @@ def test_dh_arm_equals_the_explicit_product_of_elementary_matrices():
     for q in poses(50):
         expected = np.eye(4)
         for angle, a, d, alpha in zip(q, DH_A, DH_D, DH_ALPHA, strict=True):
-            expected = expected @ elementary("z", angle) @ shift("z", d) @ shift("x", a) @ elementary("x", alpha)
+            expected = (
+                expected
+                @ elementary("z", angle)
+                @ shift("z", d)
+                @ shift("x", a)
+                @ elementary("x", alpha)
+            )
         np.testing.assert_allclose(ur5_arm().frames(q)[-1], expected, atol=1e-14)
-        np.testing.assert_allclose(ur5_arm().ball_position(q), (expected @ [*TOOL, 1.0])[:3], atol=1e-14)
+        np.testing.assert_allclose(
+            ur5_arm().ball_position(q), (expected @ [*TOOL, 1.0])[:3], atol=1e-14
+        )
 
 
 def random_model(seed, n=6):
@@ -72,11 +80,15 @@ def random_model(seed, n=6):
 
 
 @pytest.mark.parametrize(
-    "model", [nominal_ur5(), *(random_model(seed, n) for seed, n in enumerate((6, 6, 6, 2, 3, 7, 8)))]
+    "model",
+    [nominal_ur5(), *(random_model(seed, n) for seed, n in enumerate((6, 6, 6, 2, 3, 7, 8)))],
 )
 def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
     n, layout = model.arm.n, arm_layout(model.arm.n)
-    q, values = casadi.SX.sym("q", n), parameters_of(PlantSetup(model, np.zeros(n), 0.05), KinematicConfig())
+    q, values = (
+        casadi.SX.sym("q", n),
+        parameters_of(PlantSetup(model, np.zeros(n), 0.05), KinematicConfig()),
+    )
     p = casadi.DM(np.concatenate([np.ravel(values[group.name]) for group in layout.kinematic]))
     exported_feature, exported_jacobian, *_ = core_functions(layout)
     feature = symbolic_feature(model)(q)
@@ -86,14 +98,20 @@ def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
     function = casadi.Function("all", [q], outputs)
     for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, n)):
         y, J, exported_y, exported_J = (np.asarray(value) for value in function(pose))
-        np.testing.assert_allclose([y, exported_y], [model.feature(pose)[:, None]] * 2, rtol=0, atol=1e-12)
-        np.testing.assert_allclose([J, exported_J.reshape(3, n)], [model.jacobian(pose)] * 2, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            [y, exported_y], [model.feature(pose)[:, None]] * 2, rtol=0, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            [J, exported_J.reshape(3, n)], [model.jacobian(pose)] * 2, rtol=0, atol=1e-12
+        )
 
 
 def test_rotations_are_rotations_in_the_urdf_order():
     rpy = np.random.default_rng(0).uniform(-np.pi, np.pi, (10, 3))
     for (roll, pitch, yaw), R in zip(rpy, rotation_from_rpy(rpy), strict=True):
-        about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+        about_y = np.array(
+            [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+        )
         expected = elementary("z", yaw)[:3, :3] @ about_y @ elementary("x", roll)[:3, :3]
         np.testing.assert_allclose(R, expected, atol=1e-15)
 
@@ -127,7 +145,10 @@ def test_factory_calibration_is_millimetres_from_the_data_sheet():
 
 def calibration(**changes):
     """The text of a calibration file in which some blocks have other entries."""
-    blocks = {name: dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1) for name in CALIBRATION_BLOCKS}
+    blocks = {
+        name: dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1)
+        for name in CALIBRATION_BLOCKS
+    }
     blocks |= {name: entries and blocks[name] | entries for name, entries in changes.items()}
     return yaml.safe_dump({"kinematics": blocks}).encode()
 
@@ -135,7 +156,10 @@ def calibration(**changes):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (calibration().replace(b"wrist_2", b"wrist_7"), "lacks 'wrist_2'; wanted 'kinematics' with the blocks"),
+        (
+            calibration().replace(b"wrist_2", b"wrist_7"),
+            "lacks 'wrist_2'; wanted 'kinematics' with the blocks",
+        ),
         (calibration().replace(b"yaw", b"jaw"), "lacks 'yaw'"),
         (calibration(shoulder={"x": "long"}), "holds something that is not a number"),
         (calibration(shoulder=None), "holds something that is not a number"),
@@ -151,7 +175,9 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
     path = tmp_path / "calibration.yaml"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(ValueError, match=f"calibration.yaml .*{message}|{message} .*calibration.yaml") as caught:
+    with pytest.raises(
+        ValueError, match=f"calibration.yaml .*{message}|{message} .*calibration.yaml"
+    ) as caught:
         read_calibration(path, TOOL)
     assert "\n" not in str(caught.value)
 
@@ -159,20 +185,47 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: arm_from_dh([1.0], [0.0, 0.0], [0.0, 0.0], ("i", "j")), r"a must have shape \(2,\), got \(1,\)"),
-        (lambda: replace(arm_from_dh([1.0], [0.0], [0.0], ("i",)), tool=np.zeros(1)), r"tool must have shape \(3,\)"),
-        (lambda: ur5_arm().ball_position(np.zeros(5)), r"joint_position must have shape \(..., 6\), got \(5,\)"),
         (
-            lambda: SerialArm(("i",), np.zeros((1, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.zeros(3)),
+            lambda: arm_from_dh([1.0], [0.0, 0.0], [0.0, 0.0], ("i", "j")),
+            r"a must have shape \(2,\), got \(1,\)",
+        ),
+        (
+            lambda: replace(arm_from_dh([1.0], [0.0], [0.0], ("i",)), tool=np.zeros(1)),
+            r"tool must have shape \(3,\)",
+        ),
+        (
+            lambda: ur5_arm().ball_position(np.zeros(5)),
+            r"joint_position must have shape \(..., 6\), got \(5,\)",
+        ),
+        (
+            lambda: SerialArm(
+                ("i",), np.zeros((1, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.zeros(3)
+            ),
             r"translation must have shape \(2, 3\), got \(1, 3\)",
         ),
         (
-            lambda: SerialArm(("i",), np.zeros((2, 3)), np.full((2, 3), np.nan), np.zeros(1), np.ones(1), np.zeros(3)),
+            lambda: SerialArm(
+                ("i",),
+                np.zeros((2, 3)),
+                np.full((2, 3), np.nan),
+                np.zeros(1),
+                np.ones(1),
+                np.zeros(3),
+            ),
             "rpy must be finite",
         ),
-        (lambda: HandEyeModel(ur5_arm(), np.eye(3)), r"X_BC must have shape \(4, 4\), got \(3, 3\)"),
-        (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, -1.0, 1.0])), "X_BC must hold a rotation matrix"),
-        (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, 1.1, 1.0])), "X_BC must hold a rotation matrix"),
+        (
+            lambda: HandEyeModel(ur5_arm(), np.eye(3)),
+            r"X_BC must have shape \(4, 4\), got \(3, 3\)",
+        ),
+        (
+            lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, -1.0, 1.0])),
+            "X_BC must hold a rotation matrix",
+        ),
+        (
+            lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, 1.1, 1.0])),
+            "X_BC must hold a rotation matrix",
+        ),
         (
             lambda: HandEyeModel(stack([ur5_arm()] * 2), np.stack([np.eye(4), -np.eye(4)])),
             "must hold a rotation matrix",
@@ -189,7 +242,10 @@ def test_the_modified_convention_turns_about_the_axis_behind_a_link(rows):
     """A product of Craig's transforms, Rx(α) Tx(a) Rz(θ) Tz(d); a fourth row leads to the flange."""
     rng = np.random.default_rng(5)
     a, d, alpha = rng.uniform(-1.0, 1.0, (3, rows))
-    arm, angles = arm_from_dh(a, d, alpha, ("a", "b", "c"), modified=True), rng.uniform(-3.0, 3.0, 3)
+    arm, angles = (
+        arm_from_dh(a, d, alpha, ("a", "b", "c"), modified=True),
+        rng.uniform(-3.0, 3.0, 3),
+    )
     pose = np.eye(4)
     for a_i, d_i, alpha_i, angle in zip(a, d, alpha, [*angles, 0.0], strict=False):
         along, up = np.eye(4), np.eye(4)

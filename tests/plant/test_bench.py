@@ -68,7 +68,8 @@ def test_the_latency_of_a_frame_swings_about_its_mean_by_its_time_of_exposure():
         arrived = exposed[1:][arrival[1:] <= 0.1 * k + 1e-9]
         assert seen.feature[0] == pytest.approx(0.5 * arrived.max(initial=0.0))
         new = ((arrival[1:] > 0.1 * (k - 1) + 1e-9) & (arrival[1:] <= 0.1 * k + 1e-9)).any()
-        assert k <= 1 or bool(seen.feature_valid) == new  # the first frame under way shows the start
+        # The first frame under way shows the start
+        assert k <= 1 or bool(seen.feature_valid) == new
 
 
 def test_a_camera_turns_about_its_optical_axis_at_the_same_speed_on_every_plant():
@@ -79,7 +80,10 @@ def test_a_camera_turns_about_its_optical_axis_at_the_same_speed_on_every_plant(
         plant = entry.build(config, PlantSetup(model, np.array(HOME), 0.05))
         plant.reset(0)
         seen = [plant.step(Command(np.full(6, 0.1))) for _ in range(20)]
-        for back, shown in ((0, plant.truth().feature), (2, seen[-1].feature)):  # two periods of latency
+        for back, shown in (
+            (0, plant.truth().feature),
+            (2, seen[-1].feature),
+        ):  # two periods of latency
             angle = rate * 0.05 * (20 - back)
             x, y, z = model.feature(seen[-1 - back].joint_position)
             turned = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle), z
@@ -126,7 +130,9 @@ def test_a_saved_state_restores_delay_latency_noise_and_lost_frames():
         plant.restore(saved)
         again = walk(plant)
         for name in ("time", "joint_position", "feature", "feature_valid"):
-            np.testing.assert_array_equal(*([getattr(o, name) for o in run] for run in (first, again)))
+            np.testing.assert_array_equal(
+                *([getattr(o, name) for o in run] for run in (first, again))
+            )
     assert not plant.step(Command(np.zeros(2))).feature.flags.writeable
 
 

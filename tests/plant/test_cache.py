@@ -11,7 +11,14 @@ from pathlib import Path
 import pytest
 
 from servobench.plant.contract import cache
-from servobench.plant.contract.cache import MAX_AGE, MAX_ENTRIES, MIN_AGE, cache_folder, cached, is_whole
+from servobench.plant.contract.cache import (
+    MAX_AGE,
+    MAX_ENTRIES,
+    MIN_AGE,
+    cache_folder,
+    cached,
+    is_whole,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +94,9 @@ def test_nothing_is_left_of_an_entry_that_cannot_be_made():
 def test_a_folder_that_cannot_be_written_is_one_line_with_the_remedy():
     cache_folder("things").parent.mkdir(parents=True)
     cache_folder("things").write_text("a file")
-    with pytest.raises(ValueError, match="things cannot be written: .*make room there, or let XDG_CACHE_HOME name"):
+    with pytest.raises(
+        ValueError, match="things cannot be written: .*make room there, or let XDG_CACHE_HOME name"
+    ):
         cached("things", "key", Maker())
 
 
@@ -121,7 +130,8 @@ def test_entries_that_were_not_used_for_long_are_removed():
     assert left == {*names} - {names[1], names[2]}
     forget()
     cached("things", names[-1], Maker())
-    assert time.time() - (cache_folder("things") / names[-1]).stat().st_mtime < 60.0  # a use makes it young
+    # A use makes it young
+    assert time.time() - (cache_folder("things") / names[-1]).stat().st_mtime < 60.0
 
 
 def pipe(path: Path) -> None:
@@ -195,7 +205,9 @@ def test_code_of_another_user_is_not_loaded(tmp_path):
     assert cached("extracted", "key", Maker()) != other
     (tmp_path / "temporary" / f"servobench-{os.geteuid()}").chmod(0o777)
     forget()
-    with pytest.raises(ValueError, match="other users could write code into the cache folders .*XDG_CACHE_HOME"):
+    with pytest.raises(
+        ValueError, match="other users could write code into the cache folders .*XDG_CACHE_HOME"
+    ):
         cached("extracted", "key", Maker())
 
 
@@ -211,7 +223,9 @@ def test_code_is_kept_where_it_can_be_loaded_and_where_uris_read_as_paths(tmp_pa
 
 
 @pytest.mark.parametrize("home", [None, "/nonexistent", "/dev/null"])
-def test_without_a_home_a_temporary_folder_is_the_cache_and_one_line_says_so(home, tmp_path, monkeypatch):
+def test_without_a_home_a_temporary_folder_is_the_cache_and_one_line_says_so(
+    home, tmp_path, monkeypatch
+):
     said: set[str] = set()
     monkeypatch.setattr(cache, "remark", said.add)
     monkeypatch.delenv("XDG_CACHE_HOME")

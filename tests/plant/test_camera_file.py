@@ -59,13 +59,17 @@ def true_model(robot, word, seed=0, mismatch=MODERATE) -> SetupModel:
     return model
 
 
-@pytest.mark.parametrize(("word", "pose"), [("pixel", ""), ("pixel", ABOVE), ("pixel:hand", ON_FLANGE), ("plate", "")])
+@pytest.mark.parametrize(
+    ("word", "pose"), [("pixel", ""), ("pixel", ABOVE), ("pixel:hand", ON_FLANGE), ("plate", "")]
+)
 def test_its_pixels_are_those_of_opencv(write, word, pose):
     robot = robot_with(write(CAMERA + pose))
     model = Sensing.parse(word).nominal(robot)
     assert model.valid(robot.workspace.home).all()
     X = model.camera
-    postures = np.random.default_rng(1).uniform(robot.workspace.lower, robot.workspace.upper, (40, 6))
+    postures = np.random.default_rng(1).uniform(
+        robot.workspace.lower, robot.workspace.upper, (40, 6)
+    )
     seen = [posture for posture in postures if model.valid(posture).all()]
     assert len(seen) >= 5
     for posture in seen:
@@ -83,15 +87,23 @@ def test_its_jacobian_is_that_of_casadi_and_its_lanes_have_the_bits_of_single_ru
         function, x = symbolic_feature(model), casadi.SX.sym("q", 6)
         y, J, _ = model.observe(q)
         np.testing.assert_allclose(np.asarray(function(q))[:, 0], y, rtol=1e-12)
-        np.testing.assert_allclose(casadi.Function("J", [x], [casadi.jacobian(function(x), x)])(q), J, rtol=1e-9)
+        np.testing.assert_allclose(
+            casadi.Function("J", [x], [casadi.jacobian(function(x), x)])(q), J, rtol=1e-9
+        )
         for one, many in zip(model.observe(q), together, strict=True):
             np.testing.assert_array_equal(one, many[lane])
 
 
 def test_a_pixel_is_found_again_and_beyond_the_fold_nothing_is_in_the_image(write):
-    robot = robot_with(write(CAMERA.replace("k1 = 0.12, k2 = -0.25", "k1 = -0.34, k2 = 0.0").replace("0.08", "0.0")))
+    robot = robot_with(
+        write(
+            CAMERA.replace("k1 = 0.12, k2 = -0.25", "k1 = -0.34, k2 = 0.0").replace("0.08", "0.0")
+        )
+    )
     optics = Sensing.parse("pixel").nominal(robot).optics
-    pixels = np.stack(np.meshgrid(np.linspace(0, 640, 9), np.linspace(0, 480, 7)), axis=-1).reshape(1, -1, 2)
+    pixels = np.stack(np.meshgrid(np.linspace(0, 640, 9), np.linspace(0, 480, 7)), axis=-1).reshape(
+        1, -1, 2
+    )
     points = locate(pixels, np.ones((1, 63)), optics)
     np.testing.assert_allclose(project(points, optics), pixels, atol=1e-8)
     step = 1e-6 * np.random.default_rng(2).standard_normal((1, 63, 3, 1))
@@ -105,7 +117,10 @@ def test_a_pixel_is_found_again_and_beyond_the_fold_nothing_is_in_the_image(writ
 WIDE = [[330.0, 0.0, 322.5], [0.0, 331.0, 238.0], [0.0, 0.0, 1.0]]
 LENSES = [
     ("rational_polynomial", [1.2, 0.3, 0.0008, -0.0005, 0.01, 1.55, 0.65, 0.06]),
-    ("Rational Polynomial", [0.5378, -2.6486, 0.000537, -0.000307, 1.5349, 0.4155, -2.4699, 1.4627]),
+    (
+        "Rational Polynomial",
+        [0.5378, -2.6486, 0.000537, -0.000307, 1.5349, 0.4155, -2.4699, 1.4627],
+    ),
     ("equidistant", [0.0034, 0.0007, -0.002, 0.0002]),
     ("Kannala_Brandt4", [-0.008, 0.045, -0.041, 0.008]),
     ("fisheye", [0.0, 0.0, 0.0, 0.0]),
@@ -120,10 +135,14 @@ def wide_camera(lens, coefficients) -> str:
 def test_wide_lenses_are_those_of_opencv_both_ways_over_the_whole_image(write, lens, coefficients):
     model = Sensing.parse("pixel").nominal(robot_with(write(wide_camera(lens, coefficients))))
     optics, q = model.optics, find_robot("ur10e").workspace.home
-    pixels = np.stack(np.meshgrid(np.linspace(0, 640, 33), np.linspace(0, 480, 25)), axis=-1).reshape(1, -1, 2)
+    pixels = np.stack(
+        np.meshgrid(np.linspace(0, 640, 33), np.linspace(0, 480, 25)), axis=-1
+    ).reshape(1, -1, 2)
     points = locate(pixels, np.full(pixels.shape[:2], 1.3), optics)
     of_opencv = cv2.projectPoints if len(coefficients) == 8 else cv2.fisheye.projectPoints
-    wanted, _ = of_opencv(points[0][:, None], np.zeros(3), np.zeros(3), np.array(WIDE), np.array(coefficients))
+    wanted, _ = of_opencv(
+        points[0][:, None], np.zeros(3), np.zeros(3), np.array(WIDE), np.array(coefficients)
+    )
     np.testing.assert_allclose(project(points, optics)[0], wanted[:, 0], atol=1e-9)
     np.testing.assert_allclose(project(points, optics), pixels, atol=1e-9)
     points = np.append(points, [[[0.0, 0.0, 1.0], [1e-13, 0.0, 2.0]]], axis=1)
@@ -133,12 +152,16 @@ def test_wide_lenses_are_those_of_opencv_both_ways_over_the_whole_image(write, l
     function, x = symbolic_feature(model), casadi.SX.sym("q", 6)
     y, J, _ = model.observe(q)
     np.testing.assert_allclose(np.asarray(function(q))[:, 0], y, rtol=1e-12)
-    np.testing.assert_allclose(casadi.Function("J", [x], [casadi.jacobian(function(x), x)])(q), J, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        casadi.Function("J", [x], [casadi.jacobian(function(x), x)])(q), J, rtol=1e-9, atol=1e-9
+    )
 
 
 def test_the_place_of_a_fisheye_is_found_from_its_pixels(write):
     lens, coefficients = LENSES[2]
-    model = Sensing.parse("pixel").nominal(robot_with(write(wide_camera(lens, coefficients) + ABOVE)))
+    model = Sensing.parse("pixel").nominal(
+        robot_with(write(wide_camera(lens, coefficients) + ABOVE))
+    )
     work = find_robot("ur10e").workspace
     q = np.random.default_rng(0).uniform(work.lower, work.upper, (60, 6))
     poses, errors = fit_cameras(model, q[None], model.feature(q))
@@ -167,7 +190,9 @@ def test_a_wide_lens_shows_nothing_behind_its_fold_or_pole(coefficients, last):
 
 def test_mismatch_is_drawn_on_top_of_the_file(write):
     robot = robot_with(write(CAMERA + ABOVE))
-    model = true_model(robot, "pixel", mismatch=Mismatch.parse("camera_rotation=20deg+focal=10%+centre=8px"))
+    model = true_model(
+        robot, "pixel", mismatch=Mismatch.parse("camera_rotation=20deg+focal=10%+centre=8px")
+    )
     nominal = Sensing.parse("pixel").nominal(robot)
     turn = Rotation.from_matrix(nominal.camera[:3, :3].T @ model.camera[:3, :3]).magnitude()
     assert np.degrees(turn) == pytest.approx(20.0)
@@ -213,7 +238,9 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
     assert read_camera(named).files == (named, tmp_path / "ros.yaml")
 
 
-ROWS = "rows: 3\n  cols: 3\n  dt: d\n  data: [615.0, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n"
+ROWS = (
+    "rows: 3\n  cols: 3\n  dt: d\n  data: [615.0, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n"
+)
 NUMBERS = "fx: 615.0\n  fy: 617.0\n  cx: 322.5\n  cy: 238.0\n"
 FISHEYE = (0.0034, 0.0007, -0.002, 0.0002)
 TOOLS = {
@@ -242,7 +269,9 @@ def test_files_of_calibration_tools_give_the_same_camera(write, tool):
     np.testing.assert_array_equal(camera.matrix, K)
     assert (camera.keys.width, camera.keys.height) == (640, 480)
     fisheye = tool in ("kalibr", "vins_fisheye", "orb3_fisheye")
-    assert (camera.lens, camera.distortion) == (("equidistant", FISHEYE) if fisheye else ("plumb_bob", D))
+    assert (camera.lens, camera.distortion) == (
+        ("equidistant", FISHEYE) if fisheye else ("plumb_bob", D)
+    )
 
 
 BENT = "[0.12, -0.25, 0.002, -0.001, 0.08]"
@@ -259,7 +288,9 @@ def test_no_distortion_under_any_name_is_none(write, model, data):
     assert read_camera(write(text, "ros.yaml")).distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("model", ["radtan", "Plumb Bob", "plumb-bob", "PLUMB_BOB", "Brown Conrady", "opencv"])
+@pytest.mark.parametrize(
+    "model", ["radtan", "Plumb Bob", "plumb-bob", "PLUMB_BOB", "Brown Conrady", "opencv"]
+)
 def test_other_names_of_the_usual_model_are_known(write, model):
     camera = read_camera(write(ROS.replace("plumb_bob", model), "ros.yaml"))
     assert (camera.lens, camera.distortion) == ("plumb_bob", D)
@@ -268,9 +299,17 @@ def test_other_names_of_the_usual_model_are_known(write, model):
 @pytest.mark.parametrize(
     ("model", "data", "said"),
     [
-        ("Inverse Brown Conrady", BENT, "'Inverse Brown Conrady' must have no coefficients but 0, got"),
+        (
+            "Inverse Brown Conrady",
+            BENT,
+            "'Inverse Brown Conrady' must have no coefficients but 0, got",
+        ),
         ("''", BENT, "distortion_model 'none' must have no coefficients but 0"),
-        ("fov", "[0.9]", "distortion_model 'fov' is not known; wanted plumb_bob with k1, k2, p1, p2, k3, or rational"),
+        (
+            "fov",
+            "[0.9]",
+            "distortion_model 'fov' is not known; wanted plumb_bob with k1, k2, p1, p2, k3, or rational",
+        ),
         ("equidistant", "[0.1, 0.2]", "distortion must be of equidistant with k1, k2, k3, k4, got"),
         ("equidistant", "[]", "distortion must be of equidistant with k1, k2, k3, k4, got"),
         ("equidistant", BENT, "distortion must be of equidistant with k1, k2, k3, k4, got"),
@@ -279,7 +318,11 @@ def test_other_names_of_the_usual_model_are_known(write, model):
             "[0.1, -0.2, 0, 0, 0, 0.1, 0, 0]",
             "distortion must be of plumb_bob with k1, k2, p1, p2, k3, got",
         ),
-        ("rational_polynomial", "[0.1, 0, 0, 0, 0, 0.1]", "distortion must be of rational_polynomial with k1"),
+        (
+            "rational_polynomial",
+            "[0.1, 0, 0, 0, 0, 0.1]",
+            "distortion must be of rational_polynomial with k1",
+        ),
         (
             "rational_polynomial",
             "[0.1, 0, 0, 0, 0, 0.1, 0, 0, 0.01, 0, 0, 0]",
@@ -297,16 +340,25 @@ def test_coefficients_that_are_not_those_of_their_model_are_refused(write, model
 @pytest.mark.parametrize("name", ["distortion", "coeffs", "kc", "radial", "K1", "RadialDistortion"])
 def test_a_distortion_under_a_name_that_is_not_known_is_no_ideal_camera(write, name):
     for text in (name, f"lens: {{{name}: 0.1}}\nunknown"):
-        with pytest.raises(ValueError, match=f"ros.yaml has '{name}'; wanted the name distortion_coefficients"):
+        with pytest.raises(
+            ValueError, match=f"ros.yaml has '{name}'; wanted the name distortion_coefficients"
+        ):
             read_camera(write(ROS.replace("distortion_coefficients", text), "ros.yaml"))
 
 
 def test_a_projection_that_is_not_known_is_named(write):
     with pytest.raises(ValueError, match="distortion_model 'omni' is not known"):
         read_camera(write(TOOLS["kalibr"].replace("pinhole", "omni"), "tool.yaml"))
-    with pytest.raises(ValueError, match="tool.yaml is of the projection 'ds', which is not known or lacks its"):
+    with pytest.raises(
+        ValueError, match="tool.yaml is of the projection 'ds', which is not known or lacks its"
+    ):
         read_camera(
-            write(TOOLS["kalibr"].replace("pinhole", "ds").replace("intrinsics: [", "intrinsics: [-0.2, "), "tool.yaml")
+            write(
+                TOOLS["kalibr"]
+                .replace("pinhole", "ds")
+                .replace("intrinsics: [", "intrinsics: [-0.2, "),
+                "tool.yaml",
+            )
         )
 
 
@@ -315,7 +367,10 @@ def test_a_projection_that_is_not_known_is_named(write):
     [
         ("['0.1', 0, 0, 0, 0]", "a matrix must hold finite numbers, got '0.1'"),
         ("[.nan, 0, 0, 0, 0]", "a matrix must hold finite numbers, got nan"),
-        ("[0, 0, 0, 0, 0]\nD: [0.1, 0, 0, 0, 0]", "ros.yaml has distortion_coefficients and another D; leave one out"),
+        (
+            "[0, 0, 0, 0, 0]\nD: [0.1, 0, 0, 0, 0]",
+            "ros.yaml has distortion_coefficients and another D; leave one out",
+        ),
     ],
 )
 def test_numbers_that_are_none_or_contradict_each_other_are_refused(write, data, said):
@@ -325,7 +380,8 @@ def test_numbers_that_are_none_or_contradict_each_other_are_refused(write, data,
 
 def test_zeros_by_other_names_and_numbers_that_begin_with_a_point_are_read(write):
     text = ROS.replace(
-        "{rows: 1, cols: 5, data: " + BENT + "}", "{k1: .12, k2: -.25, k4: 0, p1: .002, p2: -.001, k3: .08}"
+        "{rows: 1, cols: 5, data: " + BENT + "}",
+        "{k1: .12, k2: -.25, k4: 0, p1: .002, p2: -.001, k3: .08}",
     )
     assert read_camera(write(text, "ros.yaml")).distortion == D
 
@@ -335,7 +391,11 @@ def test_zeros_by_other_names_and_numbers_that_begin_with_a_point_are_read(write
     [
         ("width = 640", "width = 12", "width must be given in px, from 16"),
         ("width = 640", "", "width must be given in px, from 16 to 20000, got 0"),
-        ("615.0", "0.0036", "a focal length of 0.0036 px does not fit a width of 640 px; in px it is the focal length"),
+        (
+            "615.0",
+            "0.0036",
+            "a focal length of 0.0036 px does not fit a width of 640 px; in px it is the focal length",
+        ),
         ("615.0", "3.6", "a focal length of 3.6 px does not fit"),
         ("322.5", "1200.0", r"the principal point \[1200.0, 238.0\] px must be in the image"),
         ("matrix = ", "matrices = ", "has no setting 'matrices': did you mean 'matrix'"),
@@ -344,14 +404,26 @@ def test_zeros_by_other_names_and_numbers_that_begin_with_a_point_are_read(write
             "-3.0",
             "folds an image of 640 × 480 px before its corners, with this matrix; take them from one calibration",
         ),
-        ("k3", "k4", "distortion has no coefficient 'k4' in plumb_bob; wanted distortion_model plumb_bob with k1, k2"),
+        (
+            "k3",
+            "k4",
+            "distortion has no coefficient 'k4' in plumb_bob; wanted distortion_model plumb_bob with k1, k2",
+        ),
         (
             "height",
             'distortion_model = "omni"\nheight',
             "distortion_model 'omni' is not known; wanted plumb_bob with k1",
         ),
-        ("height", 'distortion_model = "equidistant"\nheight', "distortion has no coefficient 'p1' in equidistant"),
-        ("[pose]", "vertical_fov = 60.0\n[pose]", "either matrix .px. or vertical_fov .deg. must be given, got both"),
+        (
+            "height",
+            'distortion_model = "equidistant"\nheight',
+            "distortion has no coefficient 'p1' in equidistant",
+        ),
+        (
+            "[pose]",
+            "vertical_fov = 60.0\n[pose]",
+            "either matrix .px. or vertical_fov .deg. must be given, got both",
+        ),
         ("[pose]", "rate = 0.05\n[pose]", "rate must be given in Hz, from 0.5 to 1000, got 0.05"),
         ("[pose]", "latency = 80\n[pose]", "latency must be given in s, from 0 to 5, got 80"),
         ('frame = "flange"', "", 'a place needs frame, "base" or "flange", and position'),
@@ -380,7 +452,11 @@ def test_an_unlikely_file_is_remarked_on(write, caplog):
             "240.0], [0.0, 617.0, 320.0]",
             "are cx and cy, or width and height, exchanged?",
         ),
-        ("k1 = 0.12, k2 = -0.25", "k1 = 12.0, k2 = -25.0", "moves points by 144% of their distance from the middle"),
+        (
+            "k1 = 0.12, k2 = -0.25",
+            "k1 = 12.0, k2 = -25.0",
+            "moves points by 144% of their distance from the middle",
+        ),
         (
             "p1 = 0.002",
             "p1 = 0.9",
@@ -393,7 +469,11 @@ def test_an_unlikely_file_is_remarked_on(write, caplog):
             "target.radius = 40\n[pose]",
             "target.radius is 40, and usually at most 0.5 m; if 40cm or 40mm is meant",
         ),
-        (ON_FLANGE, ABOVE.replace("1.9]", "15.5]"), "pose.position is 15.5, and usually at most 5 m"),
+        (
+            ON_FLANGE,
+            ABOVE.replace("1.9]", "15.5]"),
+            "pose.position is 15.5, and usually at most 5 m",
+        ),
     ]
     own.assert_remarks(caplog, lambda text: read_camera(write(text)), CAMERA + ON_FLANGE, cases)
 
@@ -407,10 +487,18 @@ def test_a_ball_that_hardly_fits_into_the_image_is_remarked_on(write, caplog):
 
 def test_a_camera_that_does_not_fit_the_set_up_is_refused_with_the_remedy(write):
     away = robot_with(write(CAMERA + ABOVE.replace("1.9]", "-1.9]"), "away.toml"))
-    with pytest.raises(ValueError, match="camera away.toml does not see the target with the arm at home"):
+    with pytest.raises(
+        ValueError, match="camera away.toml does not see the target with the arm at home"
+    ):
         Sensing.parse("pixel").nominal(away)
-    target = robot_with(write(CAMERA + ON_FLANGE + '[target]\nframe = "flange"\nposition = [0.0, 0.0, 0.1]', "t.toml"))
-    with pytest.raises(ValueError, match="the target must be on the base where the camera is on the flange"):
+    target = robot_with(
+        write(
+            CAMERA + ON_FLANGE + '[target]\nframe = "flange"\nposition = [0.0, 0.0, 0.1]', "t.toml"
+        )
+    )
+    with pytest.raises(
+        ValueError, match="the target must be on the base where the camera is on the flange"
+    ):
         Sensing.parse("pixel:hand").nominal(target)
 
 
@@ -437,8 +525,14 @@ def test_the_target_is_where_and_as_large_as_the_file_says(write):
 def test_a_frame_takes_a_multiple_of_the_period_or_its_own_time(write):
     camera = read_camera(write(f'rate = 15\nlatency = 0.08\nnoise = "2mm"{CAMERA}'))
     sensing = camera.sensing(SensingConfig(), 0.05)
-    assert (sensing.frame_period, sensing.latency, sensing.feature_noise) == (1.0 / 15.0, 0.08, 0.002)
-    assert camera.sensing(SensingConfig(), 1.0 / 30.0).frame_period == pytest.approx(1.0 / 15.0, abs=1e-12)
+    assert (sensing.frame_period, sensing.latency, sensing.feature_noise) == (
+        1.0 / 15.0,
+        0.08,
+        0.002,
+    )
+    assert camera.sensing(SensingConfig(), 1.0 / 30.0).frame_period == pytest.approx(
+        1.0 / 15.0, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -455,7 +549,9 @@ def test_the_camera_and_the_controller_keep_time(write, caplog, rate, period, fr
 
 
 def test_a_drawn_distortion_shows_nothing_behind_its_fold():
-    optics = Optics(np.array([600.0]), np.array([[320.0, 240.0]]), np.array([-0.05]), (640.0, 480.0))
+    optics = Optics(
+        np.array([600.0]), np.array([[320.0, 240.0]]), np.array([-0.05]), (640.0, 480.0)
+    )
     angle = np.radians([20.0, 77.4])  # r (1 - 0.05 r²) turns back at 68.8°
     points = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=-1)[None]
     assert (np.abs(project(points, optics)[0] - (320.0, 240.0)) < 240.0).all()
@@ -464,4 +560,6 @@ def test_a_drawn_distortion_shows_nothing_behind_its_fold():
 
 def test_a_rate_that_is_no_whole_number_of_milliseconds_is_not_that_of_the_control(write):
     camera = read_camera(write(f"rate = 120\n{CAMERA}"))
-    assert camera.sensing(SensingConfig(), 0.008).frame_period == pytest.approx(1.0 / 120.0, abs=1e-12)
+    assert camera.sensing(SensingConfig(), 0.008).frame_period == pytest.approx(
+        1.0 / 120.0, abs=1e-12
+    )

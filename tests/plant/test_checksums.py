@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from servobench.harness.batch.tables import UnwritableFolder, sums_of, writing
-from servobench.plant.contract.checksums import SUMS, append_sums, fault, keep_sums, read_sums, write_vouched
+from servobench.plant.contract.checksums import (
+    SUMS,
+    append_sums,
+    fault,
+    keep_sums,
+    read_sums,
+    write_vouched,
+)
 from servobench.plant.contract.faults import ConfigurationError
 
 DIGESTS = "a" * 64, "b" * 64, "c" * 64
@@ -21,7 +28,9 @@ def sha256(content: bytes) -> str:
 def test_the_file_is_one_that_sha256sum_reads(tmp_path):
     write_vouched(tmp_path, {"first.txt": lambda file: file.write_bytes(b"1")})
     write_vouched(tmp_path, {"second.txt": lambda file: file.write_bytes(b"2")})
-    assert (tmp_path / SUMS).read_text() == f"{sha256(b'1')}  first.txt\n{sha256(b'2')}  second.txt\n"
+    assert (
+        tmp_path / SUMS
+    ).read_text() == f"{sha256(b'1')}  first.txt\n{sha256(b'2')}  second.txt\n"
 
 
 @pytest.mark.parametrize("half", ["a", "ab", DIGESTS[0] + "  na"])
@@ -40,7 +49,9 @@ def test_a_file_may_have_the_content_of_any_of_its_lines(tmp_path):
     assert (tmp_path / SUMS).read_text() == f"{DIGESTS[0]}  one\n{DIGESTS[1]}  one\n"
 
 
-def test_a_line_is_on_the_disk_before_its_file_has_its_name_and_the_file_before_its_line(tmp_path, monkeypatch):
+def test_a_line_is_on_the_disk_before_its_file_has_its_name_and_the_file_before_its_line(
+    tmp_path, monkeypatch
+):
     events, written = [], []
     fsync, replace = os.fsync, Path.replace
 
@@ -62,7 +73,17 @@ def test_a_line_is_on_the_disk_before_its_file_has_its_name_and_the_file_before_
     first, second = (event for event in events if event[1].startswith((".first-", ".second-")))
     folder = ("on the disk", tmp_path.name)
     lines = ("on the disk", SUMS)
-    assert events == [first, lines, folder, ("named", "first"), folder, second, lines, ("named", "second"), folder]
+    assert events == [
+        first,
+        lines,
+        folder,
+        ("named", "first"),
+        folder,
+        second,
+        lines,
+        ("named", "second"),
+        folder,
+    ]
     assert written == [1, 2]
 
 
@@ -90,13 +111,19 @@ def test_a_table_is_judged_by_its_end_where_no_line_tells(tmp_path, content, unl
     (tmp_path / "runs.parquet").write_bytes(content)
     assert fault(tmp_path, "runs.parquet", {}) == unlisted
     assert fault(tmp_path, "runs.parquet", None) == unvouched
-    assert fault(tmp_path, "runs.parquet", {"runs.parquet": frozenset([DIGESTS[0], sha256(content)])}) is None
+    assert (
+        fault(tmp_path, "runs.parquet", {"runs.parquet": frozenset([DIGESTS[0], sha256(content)])})
+        is None
+    )
 
 
 def test_a_file_that_is_no_table_has_no_end_to_be_judged_by(tmp_path):
     (tmp_path / "failures.log").write_text("some text")
     assert fault(tmp_path, "failures.log", None) is None
-    assert fault(tmp_path, "failures.log", {"failures.log": frozenset(DIGESTS)}) == "was changed since it was written"
+    assert (
+        fault(tmp_path, "failures.log", {"failures.log": frozenset(DIGESTS)})
+        == "was changed since it was written"
+    )
     assert fault(tmp_path, "none", None) == "is missing"
 
 
@@ -109,14 +136,25 @@ def test_a_folder_in_the_place_of_a_file_is_named(tmp_path):
 
 
 def test_a_folder_that_takes_no_more_files_says_why_once(tmp_path):
-    full = pytest.raises(UnwritableFolder, match=f"results folder {tmp_path} cannot be written: No space left")
+    full = pytest.raises(
+        UnwritableFolder, match=f"results folder {tmp_path} cannot be written: No space left"
+    )
     with full as caught, writing(tmp_path / "other"), writing(tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.errno == errno.ENOSPC
     gone = tmp_path / "gone"
-    with pytest.raises(UnwritableFolder, match="gone cannot be written: it was removed"), writing(gone):
+    with (
+        pytest.raises(UnwritableFolder, match="gone cannot be written: it was removed"),
+        writing(gone),
+    ):
         raise FileNotFoundError(errno.ENOENT, "No such file or directory")
-    with pytest.raises(UnwritableFolder, match="cannot be written: No such file"), writing(tmp_path):
+    with (
+        pytest.raises(UnwritableFolder, match="cannot be written: No such file"),
+        writing(tmp_path),
+    ):
         raise FileNotFoundError(errno.ENOENT, "No such file or directory")
-    with pytest.raises(UnwritableFolder, match="gone cannot be written: No space left"), writing(gone):
+    with (
+        pytest.raises(UnwritableFolder, match="gone cannot be written: No space left"),
+        writing(gone),
+    ):
         raise OSError(errno.ENOSPC, "No space left on device")

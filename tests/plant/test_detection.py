@@ -41,15 +41,23 @@ def ball_image(centre, colour=RED) -> tuple[np.ndarray, np.ndarray]:
 
 def detect(rgb, depth) -> Detection | None:
     patch = find_patch(rgb)
-    return None if patch is None else locate_ball(patch, depth[patch.rows, patch.columns], CAMERA, RADIUS)
+    return (
+        None
+        if patch is None
+        else locate_ball(patch, depth[patch.rows, patch.columns], CAMERA, RADIUS)
+    )
 
 
-@pytest.mark.parametrize("centre", [(0.0, 0.0, 1.2), (0.4, -0.3, 1.3), (-0.5, 0.35, 0.9), (0.1, 0.2, 0.5)])
+@pytest.mark.parametrize(
+    "centre", [(0.0, 0.0, 1.2), (0.4, -0.3, 1.3), (-0.5, 0.35, 0.9), (0.1, 0.2, 0.5)]
+)
 def test_the_centre_of_an_ideal_ball_is_exact(centre):
     rgb, depth = ball_image(centre)
     found = detect(rgb, depth)
     np.testing.assert_allclose(found.centre, centre, atol=2e-6)
-    assert len(find_patch(rgb).rows) == pytest.approx(disc_area(found.centre, CAMERA, RADIUS), rel=0.03)
+    assert len(find_patch(rgb).rows) == pytest.approx(
+        disc_area(found.centre, CAMERA, RADIUS), rel=0.03
+    )
     assert found.residual < 1e-6
 
 
@@ -59,7 +67,9 @@ def test_reds_on_both_sides_of_hue_zero_are_found(hue):
     assert detect(*ball_image((0.0, 0.1, 1.2), colour)) is not None
 
 
-@pytest.mark.parametrize("colour", [(60, 150, 230), (200, 190, 60), (180, 170, 165), (60, 200, 60), (20, 3, 3)])
+@pytest.mark.parametrize(
+    "colour", [(60, 150, 230), (200, 190, 60), (180, 170, 165), (60, 200, 60), (20, 3, 3)]
+)
 def test_other_colours_and_the_dark_are_not_found(colour):
     assert find_patch(ball_image((0.0, 0.1, 1.2), colour)[0]) is None
 
@@ -167,7 +177,13 @@ def test_colour_noise_changes_each_pixel_by_its_deviation_and_hardly_moves_the_b
     noisy = add_colour_noise(rgb, 5.0, np.random.default_rng(0))
     patch = find_patch(rgb)
     inside = noisy[patch.rows, patch.columns].astype(float) - rgb[patch.rows, patch.columns]
-    assert 3.0 < inside[(rgb[patch.rows, patch.columns] > 20) & (rgb[patch.rows, patch.columns] < 235)].std() < 7.0
+    assert (
+        3.0
+        < inside[
+            (rgb[patch.rows, patch.columns] > 20) & (rgb[patch.rows, patch.columns] < 235)
+        ].std()
+        < 7.0
+    )
     wall = (noisy.astype(float) - rgb)[:50].ravel()
     assert wall.std() == pytest.approx(5.0, rel=0.02)
     assert abs(wall.mean()) < 0.1
@@ -178,12 +194,15 @@ def test_colour_noise_changes_each_pixel_by_its_deviation_and_hardly_moves_the_b
 def test_stereo_noise_follows_the_white_paper():
     # f at 848 px for a 60° high 4:3 image: 0.5 · 636 / tan 30°; RMS = z² · 0.08 / (f · 0.05).
     focal = 0.5 * 636 / np.tan(np.radians(30))
-    np.testing.assert_allclose(depth_deviation(RenderedConfig(), [1.0, 2.0], CAMERA), np.array([1.6, 6.4]) / focal)
+    np.testing.assert_allclose(
+        depth_deviation(RenderedConfig(), [1.0, 2.0], CAMERA), np.array([1.6, 6.4]) / focal
+    )
 
 
 def test_structured_light_noise_follows_nguyen():
     np.testing.assert_allclose(
-        depth_deviation(RenderedConfig(depth_noise="structured_light"), [0.4, 1.4], CAMERA), [0.0012, 0.0031]
+        depth_deviation(RenderedConfig(depth_noise="structured_light"), [0.4, 1.4], CAMERA),
+        [0.0012, 0.0031],
     )
 
 
@@ -191,8 +210,11 @@ def test_structured_light_noise_follows_nguyen():
 @pytest.mark.parametrize("model", ["stereo", "structured_light"])
 def test_measured_depths_scatter_by_the_models_standard_deviation_about_the_truth(model, side):
     noise = RenderedConfig(depth_noise=model, depth_patch=side, depth_quantisation=0.0)
-    measured = measure_depth(noise, np.full(20000, 1.3), GRID, (100, 200), CAMERA, np.random.default_rng(0))
-    sigma, together = float(depth_deviation(noise, 1.3, CAMERA)), 12.1 if side else 1.0  # pixels that share an error
+    measured = measure_depth(
+        noise, np.full(20000, 1.3), GRID, (100, 200), CAMERA, np.random.default_rng(0)
+    )
+    # Pixels that share an error
+    sigma, together = (float(depth_deviation(noise, 1.3, CAMERA)), 12.1 if side else 1.0)
     assert measured.std() == pytest.approx(sigma, rel=0.03 * np.sqrt(together))
     assert abs(measured.mean() - 1.3) < 4 * sigma * np.sqrt(together / 20000)
 
@@ -201,13 +223,18 @@ def test_measured_depths_scatter_by_the_models_standard_deviation_about_the_trut
 def test_depths_share_their_error_over_a_patch_and_not_beyond(side):
     noise = RenderedConfig(depth_patch=side, depth_quantisation=0.0)
     image = (
-        measure_depth(noise, np.full(20000, 1.3), GRID, (100, 200), CAMERA, np.random.default_rng(0)).reshape(100, 200)
+        measure_depth(
+            noise, np.full(20000, 1.3), GRID, (100, 200), CAMERA, np.random.default_rng(0)
+        ).reshape(100, 200)
         - 1.3
     )
     deviation = side * CAMERA.width / 848 / np.sqrt(12)
     for distance in (1, 2, 12):
         expected = np.exp(-(distance**2) / (4 * deviation**2)) if side else 0.0
-        for one, other in ((image[distance:], image[:-distance]), (image[:, distance:], image[:, :-distance])):
+        for one, other in (
+            (image[distance:], image[:-distance]),
+            (image[:, distance:], image[:, :-distance]),
+        ):
             assert np.mean(one * other) / np.mean(image**2) == pytest.approx(expected, abs=0.06)
 
 
@@ -217,14 +244,18 @@ def test_one_pixel_more_in_a_patch_moves_no_other_depth_and_no_later_frame():
     noise = ImageNoise(5)
     one = measure_depth(config, z, three, (20, 20), CAMERA, noise.stream(DEPTH, 0))
     two = Patch(three.rows[1:], three.columns[1:])
-    np.testing.assert_array_equal(measure_depth(config, z[1:], two, (20, 20), CAMERA, noise.stream(DEPTH, 0)), one[1:])
+    np.testing.assert_array_equal(
+        measure_depth(config, z[1:], two, (20, 20), CAMERA, noise.stream(DEPTH, 0)), one[1:]
+    )
     later, other = noise.next().stream(DEPTH, 0), noise.stream(DEPTH, 1)
     assert len({float(each.random()) for each in (later, other, noise.stream(DEPTH, 0))}) == 3
 
 
 def test_quantisation_rounds_to_the_sensors_unit():
     config = RenderedConfig(depth_noise="none", depth_quantisation=0.001)
-    measured = measure_depth(config, np.array([1.23449, 1.2351]), TWO, (5, 10), CAMERA, np.random.default_rng(0))
+    measured = measure_depth(
+        config, np.array([1.23449, 1.2351]), TWO, (5, 10), CAMERA, np.random.default_rng(0)
+    )
     np.testing.assert_allclose(measured, [1.234, 1.235], atol=1e-12)
 
 

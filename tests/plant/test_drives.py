@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servobench.plant.rendered.drives import PHYSICS_STEP, STICKING_SPEED, Drives, DriveState, RigidBody
+from servobench.plant.rendered.drives import (
+    PHYSICS_STEP,
+    STICKING_SPEED,
+    Drives,
+    DriveState,
+    RigidBody,
+)
 from servobench.plant.rendered.settings import DriveConfig, RenderedConfig
 
 FREE = DriveConfig(
@@ -42,7 +48,9 @@ def test_the_first_step_is_that_of_the_equations(h):
     reference = h * command
     error = command + pole / 4 * reference
     torque = pole * (np.array([1.5, 0.5]) + 0.5) * error
-    np.testing.assert_allclose(state.speed, h * np.linalg.inv(INERTIA + 0.5 * np.eye(2)) @ torque, rtol=1e-12)
+    np.testing.assert_allclose(
+        state.speed, h * np.linalg.inv(INERTIA + 0.5 * np.eye(2)) @ torque, rtol=1e-12
+    )
     np.testing.assert_allclose(state.angle, h * state.speed, rtol=1e-12)
     np.testing.assert_allclose(state.integral, h * pole / 10 * torque, rtol=1e-12)
 
@@ -61,12 +69,16 @@ def test_joints_at_rest_stay_where_gravity_is_misjudged_at_the_start():
     def sagging():
         return body((20.0, -3.0), (15.0, 1.0))
 
-    state = run(drives(), drives().start(np.array([0.1, 0.2]), sagging()), np.zeros(2), 500, sagging)
+    state = run(
+        drives(), drives().start(np.array([0.1, 0.2]), sagging()), np.zeros(2), 500, sagging
+    )
     np.testing.assert_allclose(state.angle, [0.1, 0.2], atol=1e-12)
 
 
 def test_a_load_that_appears_later_is_carried_by_the_integrals_in_the_end():
-    state = run(drives(), drives().start(np.zeros(2), body()), np.zeros(2), 300, lambda: body((2.0, 0.0)))
+    state = run(
+        drives(), drives().start(np.zeros(2), body()), np.zeros(2), 300, lambda: body((2.0, 0.0))
+    )
     sag = abs(state.angle[0])
     assert sag > 1e-3
     state = run(drives(), state, np.zeros(2), 20_000, lambda: body((2.0, 0.0)))
@@ -80,7 +92,10 @@ def test_torque_never_exceeds_its_limit_and_integrals_wait_meanwhile():
     inertia = INERTIA + 0.5 * np.eye(2)
     assert abs((inertia @ state.speed)[0]) <= 0.5 * 0.1 + 1e-12
     assert state.integral[0] == 0.0
-    assert run(drives(), drives().start(np.zeros(2), body()), (0.5, 0.0), 100).speed[0] > 2 * state.speed[0]
+    assert (
+        run(drives(), drives().start(np.zeros(2), body()), (0.5, 0.0), 100).speed[0]
+        > 2 * state.speed[0]
+    )
 
 
 def test_a_reference_waits_for_a_joint_that_cannot_follow():

@@ -6,13 +6,17 @@ import sys
 
 import pytest
 
-pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
+pytest.importorskip(
+    "pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
+)
 
 from servobench.plant.rendered.bullet import BANNER, without_banner
 
 
 def python(program, **streams):
-    return subprocess.run([sys.executable, "-c", program], text=True, timeout=120, check=True, **streams)
+    return subprocess.run(
+        [sys.executable, "-c", program], text=True, timeout=120, check=True, **streams
+    )
 
 
 @pytest.mark.slow
@@ -29,7 +33,9 @@ def test_the_engine_can_be_imported_without_a_standard_error():
 
 
 def test_naming_the_rendered_plants_loads_no_engine():
-    python("import sys, servobench.plant.rendered.plants; sys.exit(bool({'pybullet', 'mujoco'} & set(sys.modules)))")
+    python(
+        "import sys, servobench.plant.rendered.plants; sys.exit(bool({'pybullet', 'mujoco'} & set(sys.modules)))"
+    )
 
 
 def fail_to_import(descriptor):

@@ -19,7 +19,11 @@ def write(folder, *, full=False):
 
 
 def files(folder):
-    return {f"{path.relative_to(folder)}": path.read_text() for path in folder.rglob("*") if path.is_file()}
+    return {
+        f"{path.relative_to(folder)}": path.read_text()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 NEW = {"figures/a.png": "new", "table.csv": "new"}

@@ -54,7 +54,11 @@ def written(tmp_path, text):
 def test_every_key_arrives(tmp_path):
     mapping = read_mapping(FmuMapping, written(tmp_path, WHOLE))
     assert mapping.file == tmp_path / "crane.fmu"
-    assert (mapping.inputs, mapping.features, mapping.joints) == (("v[1]", "v[2]"), ("hook",), ("q",))
+    assert (mapping.inputs, mapping.features, mapping.joints) == (
+        ("v[1]", "v[2]"),
+        ("hook",),
+        ("q",),
+    )
     assert (mapping.home, mapping.period) == ("q0", 0.01)
     assert mapping.truth == TruthMapping(("hook",), ("J",), ("s",))
     assert mapping.limits == JointLimits(2.0, -3.1, 3.2)
@@ -63,7 +67,12 @@ def test_every_key_arrives(tmp_path):
     assert mapping.parameters["mass"] == 12.0
     assert mapping.nominal == {"gains": 3.0}
     assert mapping.start.tolist() == [0.3, 1.2]
-    assert read_mapping(FmuMapping, written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))).nominal is None
+    assert (
+        read_mapping(
+            FmuMapping, written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))
+        ).nominal
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,20 +80,52 @@ def test_every_key_arrives(tmp_path):
     [
         ('file = "crane.fmu"', "", "the key 'file' is missing"),
         ('features = "hook"', "", "the key 'features' is missing"),
-        ('home = "q0"', 'hoem = "q0"', r"no setting 'hoem': did you mean 'home'\? valid: camera, debug_log, features"),
-        ("mass = 12", "q0 = 1.0", "home and parameters name 'q0', the joints at the start: write start instead"),
-        ("joint_lower", "joint_low", "limits has no setting 'joint_low': did you mean 'joint_lower'"),
+        (
+            'home = "q0"',
+            'hoem = "q0"',
+            r"no setting 'hoem': did you mean 'home'\? valid: camera, debug_log, features",
+        ),
+        (
+            "mass = 12",
+            "q0 = 1.0",
+            "home and parameters name 'q0', the joints at the start: write start instead",
+        ),
+        (
+            "joint_lower",
+            "joint_low",
+            "limits has no setting 'joint_low': did you mean 'joint_lower'",
+        ),
         ('home = "q0"', "home = 3", "home must be text, got 3"),
         ('joints = ["q"]', "joints = [1]", "joints.0 must be text, got 1"),
-        ("gains = 3.0", "gains = 'large'", "nominal.gains must be a number or a list of numbers, got 'large'"),
+        (
+            "gains = 3.0",
+            "gains = 'large'",
+            "nominal.gains must be a number or a list of numbers, got 'large'",
+        ),
         ('home = "q0"', "", "start needs home, the parameter that takes it"),
         ("period = 0.01", 'period = "short"', "period must be a number, got 'short'"),
         ("period = 0.01", "period = 0.0", "period must be above 0, got 0.0"),
-        ("mass = 12", 'mass = [1, "heavy"]', "parameters.mass must be a number or a list of numbers"),
-        ("gains = 3.0", "gains = [1.0, true]", "nominal.gains must be a number or a list of numbers"),
+        (
+            "mass = 12",
+            'mass = [1, "heavy"]',
+            "parameters.mass must be a number or a list of numbers",
+        ),
+        (
+            "gains = 3.0",
+            "gains = [1.0, true]",
+            "nominal.gains must be a number or a list of numbers",
+        ),
         ("max_joint_speed = 2", "max_joint_speed = -2", "max_joint_speed must be above 0"),
-        ("max_joint_speed = 2", "max_joint_speed = [2.0, 0.0]", "max_joint_speed must be above 0, got .2.0, 0.0."),
-        ("[parameters]\nmass = 12\ngains = [1.0, 2.0]", "parameters = 1", "parameters must be a section"),
+        (
+            "max_joint_speed = 2",
+            "max_joint_speed = [2.0, 0.0]",
+            "max_joint_speed must be above 0, got .2.0, 0.0.",
+        ),
+        (
+            "[parameters]\nmass = 12\ngains = [1.0, 2.0]",
+            "parameters = 1",
+            "parameters must be a section",
+        ),
         ("period = 0.01", "period = ", "is not valid TOML"),
     ],
 )
@@ -101,15 +142,22 @@ def test_a_missing_mapping_is_told(tmp_path):
 
 def spec_of(folder, units=None, own_step=None, **roles):
     """Return the spec of an FMU with an input, outputs and parameters, of the given units, by a mapping of roles."""
-    units = {"v": "rad/s", "q": "rad", "y": "", "q0": "rad", "at": "m", "turned": "rad"} | (units or {})
+    units = {"v": "rad/s", "q": "rad", "y": "", "q0": "rad", "at": "m", "turned": "rad"} | (
+        units or {}
+    )
     causes = dict.fromkeys(units, "output") | {"v": "input", "q0": "parameter"}
     sizes = dict.fromkeys(units, 1) | {"at": 3, "turned": 3}
     variables = [
-        Variable(name, i, sizes[name], causes[name], unit=unit) for i, (name, unit) in enumerate(units.items())
+        Variable(name, i, sizes[name], causes[name], unit=unit)
+        for i, (name, unit) in enumerate(units.items())
     ]
-    described = FmuDescription(folder / "a.fmu", folder, 2, "a", "a", "", False, False, False, tuple(variables))
+    described = FmuDescription(
+        folder / "a.fmu", folder, 2, "a", "a", "", False, False, False, tuple(variables)
+    )
     described = replace(described, internal_step=own_step)
-    mapping = FmuMapping(folder / "a.fmu", **{"inputs": ("v",), "features": ("y",), "joints": ("q",)} | roles)
+    mapping = FmuMapping(
+        folder / "a.fmu", **{"inputs": ("v",), "features": ("y",), "joints": ("q",)} | roles
+    )
     return mapping_spec(mapping, described, 0.05)
 
 
@@ -120,16 +168,24 @@ def spec_of(folder, units=None, own_step=None, **roles):
 )  # fmt: skip
 def test_a_unit_of_features_that_is_not_the_fmu_s_is_refused(tmp_path, told, given, fits):
     if fits:
-        assert spec_of(tmp_path, {"y": told}, names=LogNames(feature_unit=given)).feature_unit == given
+        assert (
+            spec_of(tmp_path, {"y": told}, names=LogNames(feature_unit=given)).feature_unit == given
+        )
         return
-    with pytest.raises(ValueError, match=f"names.feature_unit must be {told}, the unit of y, got {given}"):
+    with pytest.raises(
+        ValueError, match=f"names.feature_unit must be {told}, the unit of y, got {given}"
+    ):
         spec_of(tmp_path, {"y": told}, names=LogNames(feature_unit=given))
 
 
 @pytest.mark.parametrize(
     ("role", "unit", "message"),
     [
-        ("v", "deg/s", "inputs names 'v', whose unit is deg/s; wanted rad/s: convert it in the FMU"),
+        (
+            "v",
+            "deg/s",
+            "inputs names 'v', whose unit is deg/s; wanted rad/s: convert it in the FMU",
+        ),
         ("q", "°", "joints names 'q', whose unit is deg; wanted rad: convert it in the FMU"),
         ("v", "N.m", "inputs names 'v', whose unit is N.m; wanted rad/s: name another variable"),
         ("v", "rpm", "inputs names 'v', whose unit is rpm"),
@@ -155,14 +211,23 @@ def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, m
         ({"camera": ("at", "y")}, r"a.fmu: camera\[2\] names 'y' as features does"),
         ({"camera": ("q0", "turned")}, r"camera\[1\] must name 3 numbers"),
         ({"inputs": ("q",), "joints": ()}, "inputs names 'q', which is of causality output"),
-        ({"joints": ("q", "y"), "features": ("at",)}, "joints must name 1 numbers for 1 inputs and 3 features, got 2"),
+        (
+            {"joints": ("q", "y"), "features": ("at",)},
+            "joints must name 1 numbers for 1 inputs and 3 features, got 2",
+        ),
         (
             {"limits": JointLimits(joint_lower=np.zeros(2))},
             r"limits.joint_lower must have one number or 1, got \[0.0, 0.0\]",
         ),
         ({"names": LogNames(joints=("a", "b"))}, "names.joints must hold 1 names, got 2"),
-        ({"own_step": 0.02}, "a.fmu takes steps of multiples of 0.02 s only .* must be one, got 0.05 s"),
-        ({"own_step": 0.02, "period": 0.01}, "takes steps of multiples of 0.02 s only .* got 0.01 s"),
+        (
+            {"own_step": 0.02},
+            "a.fmu takes steps of multiples of 0.02 s only .* must be one, got 0.05 s",
+        ),
+        (
+            {"own_step": 0.02, "period": 0.01},
+            "takes steps of multiples of 0.02 s only .* got 0.01 s",
+        ),
     ],
 )
 def test_a_variable_in_two_roles_or_of_the_wrong_size_is_refused(tmp_path, roles, message):
@@ -172,7 +237,10 @@ def test_a_variable_in_two_roles_or_of_the_wrong_size_is_refused(tmp_path, roles
 
 def test_steps_of_a_multiple_of_the_own_one_and_names_that_are_not_given_are_taken(tmp_path):
     spec = spec_of(tmp_path, own_step=0.01, features=("at",), period=0.03)
-    assert (spec.joint_names, spec.feature_names) == (("joint_1",), ("feature_1", "feature_2", "feature_3"))
+    assert (spec.joint_names, spec.feature_names) == (
+        ("joint_1",),
+        ("feature_1", "feature_2", "feature_3"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -184,16 +252,21 @@ def test_a_step_longer_than_that_the_fmu_is_meant_for_is_remarked_on(usual, peri
     names = (Path("a.fmu"), Path(), 2, "a", "a", "", False, False, False, ())
     described = FmuDescription(*names, usual_step=usual, exchange=exchange)
     text = unusual_step(FmuMapping(Path("a.fmu"), ("v",), ("y",), period=period), described, 0.05)
-    wanted = (
-        "a.fmu is meant to take steps of 0.01 s and takes those of the control period, 0.05 s; period = 0.01 in the"
-    )
+    wanted = "a.fmu is meant to take steps of 0.01 s and takes those of the control period, "
+    wanted += "0.05 s; period = 0.01 in the"
     assert text.startswith(wanted) if told else not text
 
 
-def test_features_of_two_quantities_with_a_joint_and_outputs_named_twice_are_taken(tmp_path, caplog):
+def test_features_of_two_quantities_with_a_joint_and_outputs_named_twice_are_taken(
+    tmp_path, caplog
+):
     truth = TruthMapping(jacobian=("zero", "zero"))
     spec = spec_of(
-        tmp_path, {"y": "m", "flag": "", "zero": "m"}, features=("y", "q"), seen=("flag", "flag"), truth=truth
+        tmp_path,
+        {"y": "m", "flag": "", "zero": "m"},
+        features=("y", "q"),
+        seen=("flag", "flag"),
+        truth=truth,
     )
     assert spec.m == 2
     assert "features name the joint q; a camera measures other quantities" in caplog.text

@@ -66,7 +66,12 @@ def test_a_sphere_off_the_axis_has_its_centre_where_the_ray_through_it_appears()
 @pytest.mark.parametrize("depth", [0.4, 0.25])
 def test_a_ball_is_found_though_its_stick_hides_some_of_the_rim_and_not_if_half_is_hidden(depth):
     radius = CAMERA.focal * 0.035 / depth
-    for wide, below, whole in ((0.25, 0.86, True), (0.25, 0.5, True), (1.2, 0.5, False), (0.8, 0.2, False)):
+    for wide, below, whole in (
+        (0.25, 0.86, True),
+        (0.25, 0.5, True),
+        (1.2, 0.5, False),
+        (0.8, 0.2, False),
+    ):
         image = blank()
         u, v = draw_sphere(image, 0, (0.0, 0.0, depth), 0.035)
         image[(np.abs(COLUMNS - u) < wide * radius) & (ROWS - v > below * radius)] = (66, 71, 79)
@@ -116,14 +121,26 @@ def test_no_colour_of_a_mark_is_found_as_that_of_another():
         for shade in (0.4, 0.7, 1.0):
             image = blank()
             draw_disc(image, mark, (0.0, 0.0, 0.5), 0.03)
-            image = np.where((image == paint(mark)).all(axis=-1)[..., None], (shade * image).astype(np.uint8), image)
-            assert [found is not None for found in find_marks(image, MARK_COLOURS)] == [i == mark for i in range(4)]
+            image = np.where(
+                (image == paint(mark)).all(axis=-1)[..., None],
+                (shade * image).astype(np.uint8),
+                image,
+            )
+            assert [found is not None for found in find_marks(image, MARK_COLOURS)] == [
+                i == mark for i in range(4)
+            ]
 
 
 def test_pixels_are_located_where_their_points_are():
     points = np.random.default_rng(0).uniform((-0.5, -0.4, 1.0), (0.5, 0.4, 1.0), (1, 50, 3))
-    for optics in (ideal_optics(CAMERA, 1), BENT, Optics(BENT.focal, BENT.centre, np.array([0.1]), BENT.size)):
-        np.testing.assert_allclose(locate(project(points, optics), points[..., 2], optics), points, atol=1e-12)
+    for optics in (
+        ideal_optics(CAMERA, 1),
+        BENT,
+        Optics(BENT.focal, BENT.centre, np.array([0.1]), BENT.size),
+    ):
+        np.testing.assert_allclose(
+            locate(project(points, optics), points[..., 2], optics), points, atol=1e-12
+        )
 
 
 def test_what_no_point_can_show_is_finite_and_at_the_edge():
@@ -142,7 +159,9 @@ class Wall(Scene):
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.rays(columns.ravel(), rows.ravel()).reshape(camera.height, camera.width, 3)
         image = np.full((camera.height, camera.width, 3), 200, dtype=np.uint8)
-        image[np.linalg.norm(rays * self.centre[2] - self.centre, axis=-1) <= self.radius] = paint(1)
+        image[np.linalg.norm(rays * self.centre[2] - self.centre, axis=-1) <= self.radius] = paint(
+            1
+        )
         image = (window or detection.whole(camera)).cut(image)
         return image, np.zeros(image.shape[:2])
 
@@ -155,7 +174,10 @@ class Wall(Scene):
 @pytest.mark.parametrize(
     ("camera", "optics", "centre"),
     [
-        *((CAMERA, BENT, centre) for centre in ((0.0, 0.0, 0.5), (0.3, -0.2, 0.6), (-0.28, 0.17, 0.5))),
+        *(
+            (CAMERA, BENT, centre)
+            for centre in ((0.0, 0.0, 0.5), (0.3, -0.2, 0.6), (-0.28, 0.17, 0.5))
+        ),
         (TALL, replace(ideal_optics(TALL, 1), distortion=np.array([0.001])), (0.0, -0.23, 0.5)),
     ],
 )
@@ -187,7 +209,8 @@ def test_a_point_that_only_the_ideal_image_is_wide_enough_for_is_not_in_view():
 def test_a_camera_as_planned_needs_no_lens():
     wall = Wall((0.0, 0.0, 0.5), 0.03)
     np.testing.assert_array_equal(
-        Lens(CAMERA, ideal_optics(CAMERA, 2), 1).render(wall, np.eye(4)), wall.render(CAMERA, np.eye(4))[0]
+        Lens(CAMERA, ideal_optics(CAMERA, 2), 1).render(wall, np.eye(4)),
+        wall.render(CAMERA, np.eye(4))[0],
     )
     assert as_planned(ideal_optics(CAMERA, 2), CAMERA)
     assert not as_planned(BENT, CAMERA)
@@ -195,6 +218,10 @@ def test_a_camera_as_planned_needs_no_lens():
 
 def test_only_set_ups_whose_features_change_along_a_ray_need_depth():
     wanted = {"position": True, "pixel": False, "stereo": False, "plate": False}
-    assert {name: needs_depth(eye, ideal_optics(CAMERA, eye.cameras)) for name, eye in SETUPS.items()} == wanted
-    ratio = replace(SETUPS["pixel"], measure=lambda points, _: points[..., 0, 0, :2] / points[..., 0, 0, 2:])
+    assert {
+        name: needs_depth(eye, ideal_optics(CAMERA, eye.cameras)) for name, eye in SETUPS.items()
+    } == wanted
+    ratio = replace(
+        SETUPS["pixel"], measure=lambda points, _: points[..., 0, 0, :2] / points[..., 0, 0, 2:]
+    )
     assert not needs_depth(ratio, ideal_optics(CAMERA, 1))

@@ -22,7 +22,9 @@ COMMANDS = np.random.default_rng(4).uniform(-0.3, 0.3, (12, 6)).repeat(6, axis=0
 
 def opened(name, model, start, **mechanics):
     entry = find_plant(name)
-    config = replace(configure(entry.config, feature_noise=0.0), mechanics=MechanicsConfig(**mechanics))
+    config = replace(
+        configure(entry.config, feature_noise=0.0), mechanics=MechanicsConfig(**mechanics)
+    )
     plant = entry.build(config, PlantSetup(model, start, 0.05))
     plant.reset(0)
     return plant
@@ -42,7 +44,9 @@ def test_a_joint_follows_its_gear_through_the_play():
     for q in (0.05, 0.1, 0.3, 0.25, 0.15, 0.1, 0.0, -0.2, -0.1, 0.05):
         x = gear.driven(x, np.array([q]))
         came.append(float(x[0]))
-    np.testing.assert_allclose(came, [0.0, 0.0, 0.2, 0.2, 0.2, 0.2, 0.1, -0.1, -0.1, -0.05], atol=1e-15)
+    np.testing.assert_allclose(
+        came, [0.0, 0.0, 0.2, 0.2, 0.2, 0.2, 0.1, -0.1, -0.1, -0.05], atol=1e-15
+    )
     q, v = np.array([0.3, 0.3, 0.3]), np.array([1.0, -1.0, 1.0])
     np.testing.assert_array_equal(gear.driven_velocity(q - [0.1, 0.1, 0.0], q, v), [1.0, 0.0, 0.0])
 
@@ -51,7 +55,9 @@ def test_ripple_leads_the_joint_eight_times_in_a_turn():
     gear = MechanicsConfig(ripple=0.03)
     quarter = np.pi / 16  # of the first period
     q = np.array([0.0, quarter, 2 * quarter, 3 * quarter, 0.1])
-    np.testing.assert_allclose(gear.driven(q, q) - q, [0.0, 0.03, 0.0, -0.03, 0.03 * np.sin(0.8)], atol=1e-15)
+    np.testing.assert_allclose(
+        gear.driven(q, q) - q, [0.0, 0.03, 0.0, -0.03, 0.03 * np.sin(0.8)], atol=1e-15
+    )
     np.testing.assert_allclose(gear.slope(q)[:4], [1.24, 1.0, 0.76, 1.0], atol=1e-12)
 
 
@@ -95,7 +101,11 @@ def test_a_flexible_tool_answers_a_changing_acceleration_exactly():
 
 @pytest.mark.parametrize(
     ("sensing", "mechanics"),
-    [("position", ALL), ("position", {"tool_frequency": 12.0}), ("plate", {"backlash": 0.035, "ripple": 0.03})],
+    [
+        ("position", ALL),
+        ("position", {"tool_frequency": 12.0}),
+        ("plate", {"backlash": 0.035, "ripple": 0.03}),
+    ],
 )
 def test_both_plants_agree(sensing, mechanics):
     mismatch, robot, walked = Mismatch.parse("severe"), find_robot("ur5"), []
@@ -130,6 +140,10 @@ def test_a_flexible_tool_needs_the_ball_in_space(name):
 
 def test_the_words_of_a_mismatch_are_settings_of_the_plant():
     mismatch = Mismatch.parse("moderate+backlash=2deg+ripple=0.03rad+flexible_tool=12")
-    found = {"mechanics.backlash": np.radians(2.0), "mechanics.ripple": 0.03, "mechanics.tool_frequency": 12.0}
+    found = {
+        "mechanics.backlash": np.radians(2.0),
+        "mechanics.ripple": 0.03,
+        "mechanics.tool_frequency": 12.0,
+    }
     assert mismatch.plant_settings == pytest.approx(found)
     assert Mismatch.parse(str(mismatch)) == mismatch

@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from kit.plants import factory_ur5, nominal_ur5
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.mismatch import AXES, MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
+from servobench.plant.robot.mismatch import (
+    AXES,
+    MAX_TILT,
+    Magnitude,
+    Mismatch,
+    parse_magnitudes,
+    sample_mismatch,
+)
 from servobench.plant.robot.workspace import CENTRE
 
 POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
@@ -16,22 +23,29 @@ POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
 
 def test_no_mismatch_leaves_the_model_as_it_is():
     model, _ = sample_mismatch(Mismatch.parse("none"), find_robot("ur5"), 3)
-    np.testing.assert_allclose(model.feature(POSES), nominal_ur5().feature(POSES), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        model.feature(POSES), nominal_ur5().feature(POSES), rtol=0, atol=1e-12
+    )
 
 
 def test_the_same_seed_draws_the_same_robot_and_another_seed_another():
     mismatch = Mismatch.parse("severe")
-    records = [sample_mismatch(mismatch, find_robot("ur5"), seed)[1].as_record() for seed in (5, 5, 6)]
+    records = [
+        sample_mismatch(mismatch, find_robot("ur5"), seed)[1].as_record() for seed in (5, 5, 6)
+    ]
     assert records[0] == records[1]
     assert records[0] != records[2]
     assert json.loads(json.dumps(records[0])) == records[0]
 
 
 @pytest.mark.parametrize(
-    ("text", "links", "offset", "angle", "tool"), [("moderate", 0.05, 3, 15, 0.02), ("severe", 0.1, 6, 45, 0.04)]
+    ("text", "links", "offset", "angle", "tool"),
+    [("moderate", 0.05, 3, 15, 0.02), ("severe", 0.1, 6, 45, 0.04)],
 )
 def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset, angle, tool):
-    samples = [sample_mismatch(Mismatch.parse(text), find_robot("ur5"), seed)[1] for seed in range(200)]
+    samples = [
+        sample_mismatch(Mismatch.parse(text), find_robot("ur5"), seed)[1] for seed in range(200)
+    ]
     for values, bound in (
         ([sample.link_scale - 1 for sample in samples], links),
         ([sample.joint_offset for sample in samples], math.radians(offset)),
@@ -47,20 +61,30 @@ def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset,
 def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(angle):
     nominal = nominal_ur5()
     for seed in range(100):
-        true, _ = sample_mismatch(Mismatch.parse(f"camera_rotation={angle}deg"), find_robot("ur5"), seed)
+        true, _ = sample_mismatch(
+            Mismatch.parse(f"camera_rotation={angle}deg"), find_robot("ur5"), seed
+        )
         R = nominal.X_BC[:3, :3].T @ true.X_BC[:3, :3]
-        assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(math.radians(angle), abs=1e-6)
+        assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(
+            math.radians(angle), abs=1e-6
+        )
         assert math.acos(min(R[2, 2], 1.0)) <= MAX_TILT + 1e-9
         np.testing.assert_allclose(true.to_camera(CENTRE), nominal.to_camera(CENTRE), atol=1e-12)
 
 
 def test_a_larger_magnitude_goes_further_in_the_same_direction():
-    small, large = (sample_mismatch(Mismatch.parse(f"links={size}%"), find_robot("ur5"), 4)[1] for size in (5, 10))
+    small, large = (
+        sample_mismatch(Mismatch.parse(f"links={size}%"), find_robot("ur5"), 4)[1]
+        for size in (5, 10)
+    )
     np.testing.assert_allclose(2 * (small.link_scale - 1), large.link_scale - 1, atol=1e-12)
 
 
 def test_an_axis_is_added_to_a_profile_or_stands_instead_of_its_own_and_is_refused_twice():
-    both, once = Mismatch.parse("moderate+gear_ratio=5%"), Mismatch.parse("moderate+camera_rotation=0.5rad")
+    both, once = (
+        Mismatch.parse("moderate+gear_ratio=5%"),
+        Mismatch.parse("moderate+camera_rotation=0.5rad"),
+    )
     assert (both.size("links"), both.size("gear_ratio"), both.camera_exact) == (0.05, 0.05, False)
     assert (once.size("camera_rotation"), once.camera_exact) == (0.5, True)
     with pytest.raises(ValueError, match="has the axis camera_rotation twice; give it once"):
@@ -91,8 +115,14 @@ def test_a_mismatch_prints_the_text_it_was_read_from_and_travels(text):
 def test_an_axis_is_put_on_top_of_a_mismatch():
     turned = Magnitude(60.0, "deg")
     assert str(Mismatch().with_axis("camera_rotation", turned)) == "camera_rotation=60deg"
-    assert str(Mismatch.parse("moderate").with_axis("camera_rotation", turned)) == "moderate+camera_rotation=60deg"
-    assert str(Mismatch.parse("tool=5mm").with_axis("camera_rotation", turned)) == "tool=5mm+camera_rotation=60deg"
+    assert (
+        str(Mismatch.parse("moderate").with_axis("camera_rotation", turned))
+        == "moderate+camera_rotation=60deg"
+    )
+    assert (
+        str(Mismatch.parse("tool=5mm").with_axis("camera_rotation", turned))
+        == "tool=5mm+camera_rotation=60deg"
+    )
 
 
 def test_factory_takes_the_arm_of_the_calibration_file():

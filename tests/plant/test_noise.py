@@ -42,7 +42,10 @@ FAMILIES = {
     "uniform": (families.uniform, stats.uniform(-math.sqrt(3.0), 2.0 * math.sqrt(3.0)).cdf),
     "cauchy": (partial(families.stable, stability=1.0), stats.cauchy(scale=math.sqrt(0.5)).cdf),
     "gaussian": (partial(families.stable, stability=2.0), stats.norm.cdf),
-    "levy": (partial(families.stable, stability=0.5, skewness=1.0), stats.levy(scale=math.sqrt(0.5)).cdf),
+    "levy": (
+        partial(families.stable, stability=0.5, skewness=1.0),
+        stats.levy(scale=math.sqrt(0.5)).cdf,
+    ),
 }
 
 
@@ -92,7 +95,11 @@ def test_spells_have_their_share_length_and_autocorrelation(share, frames):
         values.append(np.where(spell.inside, spell.value, 0.0))
     held, x = np.array(inside), np.array(values)[200:]
     assert held.mean() == pytest.approx(share, abs=0.01)
-    lengths = [len(run) for run in np.split(x[:, 0], np.nonzero(np.diff(x[:, 0]))[0] + 1)[1:-1] if run[0] != 0.0]
+    lengths = [
+        len(run)
+        for run in np.split(x[:, 0], np.nonzero(np.diff(x[:, 0]))[0] + 1)[1:-1]
+        if run[0] != 0.0
+    ]
     assert set(lengths) == {frames}
     for lag in (0, 1, frames - 1, frames, frames + 3):
         expected = share * max(0.0, (frames - lag) / frames)
@@ -105,7 +112,10 @@ def watched(periods=400, seed=3, **sensing):
     plant.reset(seed)
     truth = plant.truth().feature
     seen = [plant.step(Command(np.zeros(6))) for _ in range(periods)]
-    times, valid = np.array([each.time for each in seen]), np.array([each.feature_valid for each in seen])
+    times, valid = (
+        np.array([each.time for each in seen]),
+        np.array([each.feature_valid for each in seen]),
+    )
     return times, np.array([each.feature for each in seen]) - truth, valid
 
 
@@ -150,12 +160,15 @@ def test_jitter_delays_frames_by_a_time_of_their_own_and_keeps_their_order():
         ages = len(exposed) - 1 - np.nonzero(np.all(np.array(exposed) == seen.feature, axis=1))[0]
         late.append((int(ages[0]), bool(seen.feature_valid)))
     ages = np.array([age for age, valid in late[10:] if valid])
-    assert set(ages) == {2, 3, 4, 5}  # latency of 1 period, jitter of up to 4, seen at whole periods
+    # Latency of 1 period, jitter of up to 4, seen at whole periods
+    assert set(ages) == {2, 3, 4, 5}
     assert 0.02 < np.mean([not valid for _, valid in late[10:]]) < 0.5
 
 
 def test_families_reach_the_feature_scaled_by_deviation_and_factor():
-    _, error, _ = watched(1500, noise="bimodal", noise_share=0.5, noise_offset=0.02, noise_factor=2.0)
+    _, error, _ = watched(
+        1500, noise="bimodal", noise_share=0.5, noise_offset=0.02, noise_factor=2.0
+    )
     expected = {"loc": 0.04, "scale": 0.002}
     upper = error[error > 0.02]
     assert len(upper) / error.size == pytest.approx(0.25, abs=0.03)
@@ -172,7 +185,9 @@ def test_switching_a_part_on_leaves_the_random_numbers_of_the_others():
 
 @pytest.mark.parametrize("windows", [((0.0, 1.0),), ((2.0, 1.0),), ((1.0, 2.0), (3.0, 3.0))])
 def test_a_window_that_is_none_is_refused(windows):
-    with pytest.raises(ValueError, match=r"^occlusion_windows must be pairs of a begin above 0.*got \[[0-9, ]+\]$"):
+    with pytest.raises(
+        ValueError, match=r"^occlusion_windows must be pairs of a begin above 0.*got \[[0-9, ]+\]$"
+    ):
         SensingConfig(occlusion_windows=windows)
 
 
@@ -186,11 +201,15 @@ def test_a_word_of_the_sensor_sets_its_setting_and_draws_no_other_robot(axis):
     example = SENSOR_AXES[axis].example
     mismatch = Mismatch.parse(f"moderate+{axis}={example}")
     assert str(mismatch) == f"moderate+{axis}={example}"
-    changed = SensingConfig(**{key.removeprefix("sensing."): value for key, value in mismatch.plant_settings.items()})
+    changed = SensingConfig(
+        **{key.removeprefix("sensing."): value for key, value in mismatch.plant_settings.items()}
+    )
     assert changed != SensingConfig()
     assert getattr(changed, SENSOR_AXES[axis].setting) == pytest.approx(mismatch.size(axis))
     assert changed.noise == (SENSOR_AXES[axis].family or "white")
-    np.testing.assert_array_equal(mismatched(str(mismatch)).arm.tool, mismatched("moderate").arm.tool)
+    np.testing.assert_array_equal(
+        mismatched(str(mismatch)).arm.tool, mismatched("moderate").arm.tool
+    )
 
 
 @pytest.mark.parametrize(
@@ -198,8 +217,14 @@ def test_a_word_of_the_sensor_sets_its_setting_and_draws_no_other_robot(axis):
     [
         ("outliers=100%", "outliers must be below 100%, got 100%"),
         ("stable=0", "stable must be at least 0.5, got 0"),
-        ("stable=1.5+mixture=10%", "noise is of one family, got stable and mixture; give one of them"),
-        ("jitter=3deg", "jitter needs a magnitude with one of the units 'ms', 's', such as jitter=100ms; got '3deg'"),
+        (
+            "stable=1.5+mixture=10%",
+            "noise is of one family, got stable and mixture; give one of them",
+        ),
+        (
+            "jitter=3deg",
+            "jitter needs a magnitude with one of the units 'ms', 's', such as jitter=100ms; got '3deg'",
+        ),
         ("outlier=3%", "did you mean 'outliers'?"),
     ],
 )

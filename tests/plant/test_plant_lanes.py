@@ -23,7 +23,8 @@ PERIODS, MOVE = 70, 40  # further than one block of random numbers
 COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (PERIODS, 3, 6))
 MOVED = np.array([mismatched("camera_rotation=40deg", seed).X_BC for seed in SEEDS])
 WORST = {"command_delay": 0.15, "latency": 0.1, "drop_probability": 0.2, "camera_turn": 0.3}
-FINE = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3}  # sub-steps of 10 ms
+# Sub-steps of 10 ms
+FINE = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3}
 DISTURBED = {
     "noise": "stable", "latency": 0.05, "jitter": 0.09, "latency_swing": 0.1, "swing_period": 2.0,
     "outliers": 0.3, "outlier_duration": 0.2, "quantum": 1e-4,
@@ -48,9 +49,19 @@ def build(request):
     assert entry.side_by_side
 
     def made(chosen):
-        model = MODELS[chosen] if np.ndim(chosen) == 0 else lanes.stack([MODELS[lane] for lane in chosen])
-        opened.append(entry.build(configure(entry.config, **settings), PlantSetup(model, STARTS[chosen], 0.05)))
-        opened[-1].reset(SEEDS[chosen] if np.ndim(chosen) == 0 else [SEEDS[lane] for lane in chosen])
+        model = (
+            MODELS[chosen]
+            if np.ndim(chosen) == 0
+            else lanes.stack([MODELS[lane] for lane in chosen])
+        )
+        opened.append(
+            entry.build(
+                configure(entry.config, **settings), PlantSetup(model, STARTS[chosen], 0.05)
+            )
+        )
+        opened[-1].reset(
+            SEEDS[chosen] if np.ndim(chosen) == 0 else [SEEDS[lane] for lane in chosen]
+        )
         return opened[-1]
 
     yield made
@@ -65,8 +76,19 @@ def walk(plant, chosen, periods=range(PERIODS)):
         if k == MOVE:
             plant.move_camera(MOVED[chosen])
         seen, truth = plant.step(Command(COMMANDS[k, chosen])), plant.truth()
-        assert not any(each.flags.writeable for each in (seen.joint_position, seen.feature, seen.valid))
-        rows.append((seen.joint_position, seen.feature, seen.feature_valid, seen.valid, truth.feature, truth.jacobian))
+        assert not any(
+            each.flags.writeable for each in (seen.joint_position, seen.feature, seen.valid)
+        )
+        rows.append(
+            (
+                seen.joint_position,
+                seen.feature,
+                seen.feature_valid,
+                seen.valid,
+                truth.feature,
+                truth.jacobian,
+            )
+        )
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
@@ -82,7 +104,13 @@ def test_an_arm_has_the_same_bits_alone_and_among_others():
 
     def everything(model, q):
         points = model.feature(q)
-        return (model.arm.frames(q), points, model.jacobian(q), TrueJacobian(model)(q), model.to_base(points))
+        return (
+            model.arm.frames(q),
+            points,
+            model.jacobian(q),
+            TrueJacobian(model)(q),
+            model.to_base(points),
+        )
 
     together, permuted = everything(stacked, q), everything(lanes.take(stacked, order), q[:, order])
     for k, (place, lane) in product(range(20), enumerate(order)):
@@ -129,7 +157,9 @@ def test_what_does_not_fit_the_number_of_runs_is_refused(build):
 @pytest.mark.parametrize("lane", [None, 1])
 def test_joints_that_leave_the_finite_numbers_end_their_run_only(lane):
     model = nominal_ur5() if lane is None else lanes.stack([nominal_ur5()] * 3)
-    world = KinematicWorld(KinematicConfig(), PlantSetup(model, STARTS[0] if lane is None else STARTS, 0.05))
+    world = KinematicWorld(
+        KinematicConfig(), PlantSetup(model, STARTS[0] if lane is None else STARTS, 0.05)
+    )
     q = world.reset(SEEDS)
     v = np.zeros(q.shape)
     v[lane] = np.inf
@@ -140,7 +170,9 @@ def test_joints_that_leave_the_finite_numbers_end_their_run_only(lane):
         return
     for _ in range(2):
         np.testing.assert_array_equal(world.advance(np.zeros((3, 6))), STARTS)
-        assert [(place, fault.status) for place, fault in world.faults.items()] == [(1, "plant_diverged")]
+        assert [(place, fault.status) for place, fault in world.faults.items()] == [
+            (1, "plant_diverged")
+        ]
         assert np.isfinite(world.truth().feature).all()
     world.keep(np.array([0, 2]))
     assert not world.faults

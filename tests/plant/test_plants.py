@@ -19,7 +19,9 @@ from servobench.plant.robot.ur5 import HOME
 
 PERIOD = 0.05
 COMMANDS = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 6))
-MODEL, SAMPLE = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
+MODEL, SAMPLE = sample_mismatch(
+    Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1
+)
 MOVED = SAMPLE.moved(MODEL, find_robot("ur5"))  # the same robot after a move of its camera
 
 
@@ -27,7 +29,11 @@ MOVED = SAMPLE.moved(MODEL, find_robot("ur5"))  # the same robot after a move of
 def entry(request) -> PlantEntry:
     """The entry of each plant, without table and floor, which change no bit of an observation."""
     found = find_plant(request.param)
-    return replace(found, config=partial(found.config, scenery=False)) if request.param in RENDERED else found
+    return (
+        replace(found, config=partial(found.config, scenery=False))
+        if request.param in RENDERED
+        else found
+    )
 
 
 @pytest.fixture
@@ -52,7 +58,10 @@ def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_
     def continued() -> list[bytes]:
         seen = [plant.step(Command(u)) for u in COMMANDS]
         truth = plant.truth()
-        arrays = [each for o in seen for each in (o.joint_position, o.feature)] + [truth.feature, truth.jacobian]
+        arrays = [each for o in seen for each in (o.joint_position, o.feature)] + [
+            truth.feature,
+            truth.jacobian,
+        ]
         return [each.tobytes() for each in arrays]
 
     plant.reset(5)
@@ -66,7 +75,9 @@ def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_
         assert continued() == expected
 
 
-def test_a_picture_disturbs_neither_the_run_nor_its_random_streams_and_another_seed_is_another_run(plant):
+def test_a_picture_disturbs_neither_the_run_nor_its_random_streams_and_another_seed_is_another_run(
+    plant,
+):
     runs, pictures = [], []
     for seed, drawn in ((3, False), (3, True), (8, False)):
         plant.reset(seed)
@@ -76,12 +87,15 @@ def test_a_picture_disturbs_neither_the_run_nor_its_random_streams_and_another_s
             runs[-1].append(plant.step(Command(u)).feature.tobytes())
     assert runs[0] == runs[1] != runs[2]
     for picture in pictures:
-        assert picture is None or (picture.dtype == np.uint8 and picture.ndim == 3 and picture.std() > 0)
+        assert picture is None or (
+            picture.dtype == np.uint8 and picture.ndim == 3 and picture.std() > 0
+        )
 
 
 def test_a_moved_camera_shows_the_ball_elsewhere_as_late_as_its_frames_and_until_the_reset(entry):
     config = override("plant", entry.config(), {"sensing": {"latency": 3 * PERIOD}})
-    start = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # far from the point about which the camera turns
+    # Far from the point about which the camera turns
+    start = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
     with contextlib.closing(entry.build(config, PlantSetup(MODEL, start, PERIOD))) as plant:
         plant.reset(0)
         before = plant.truth()
@@ -100,8 +114,13 @@ def test_a_moved_camera_shows_the_ball_elsewhere_as_late_as_its_frames_and_until
 def test_noise_can_be_varied(entry):
     def spread(factor: float) -> float:
         config = override("plant", entry.config(), {"sensing": {"noise_factor": factor}})
-        with contextlib.closing(entry.build(config, PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))) as plant:
-            seen = [plant.reset(4).feature, *(plant.step(Command(np.zeros(6))).feature for _ in range(12))]
+        with contextlib.closing(
+            entry.build(config, PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
+        ) as plant:
+            seen = [
+                plant.reset(4).feature,
+                *(plant.step(Command(np.zeros(6))).feature for _ in range(12)),
+            ]
         return float(np.std(seen, axis=0).max())
 
     quiet, usual, loud = spread(0.0), spread(1.0), spread(3.0)

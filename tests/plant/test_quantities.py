@@ -45,8 +45,14 @@ def test_decimal_parts_are_the_numbers_that_they_are_written_as():
 def test_settings_take_units():
     config = read("kinematic.sensing.latency=80ms")
     assert config.sensing.latency == 0.08
-    assert read("kinematic.sensing.occlusion_windows=[['100ms', 0.5]]").sensing.occlusion_windows == ((0.1, 0.5),)
-    assert read("run.period=1/30").period == read("run.period=1/30 s").period == read("run.period=30Hz").period
+    assert read(
+        "kinematic.sensing.occlusion_windows=[['100ms', 0.5]]"
+    ).sensing.occlusion_windows == ((0.1, 0.5),)
+    assert (
+        read("run.period=1/30").period
+        == read("run.period=1/30 s").period
+        == read("run.period=30Hz").period
+    )
     assert read("kinematic.sensing.feature_noise=2px").sensing.feature_noise == "2px"
     assert read("kinematic.sensing.feature_noise=2mm").sensing.feature_noise == 0.002
     assert read("run.period=125Hz").period == 0.008
@@ -60,15 +66,27 @@ def test_settings_take_units():
         ("kinematic.lag=0,05", "kinematic.lag must be a number in s, ms, us, min, Hz, got '0,05'"),
         ("kinematic.lag=1/0", "kinematic.lag must be a number, got '1/0'"),
         ("kinematic.lag=fast", "kinematic.lag must be a number, got 'fast'"),
-        ("kinematic.max_joint_speed=-57deg/s", "kinematic.max_joint_speed must be above 0deg/s, got -57deg/s"),
+        (
+            "kinematic.max_joint_speed=-57deg/s",
+            "kinematic.max_joint_speed must be above 0deg/s, got -57deg/s",
+        ),
         (
             "kinematic.sensing.drop_probability=5",
             "kinematic.sensing.drop_probability must be below 1, got 5; if 5% is meant, write the unit, too",
         ),
-        ("kinematic.sensing.drop_probability=120%", "drop_probability must be below 100%, got 120%"),
+        (
+            "kinematic.sensing.drop_probability=120%",
+            "drop_probability must be below 100%, got 120%",
+        ),
         ("kinematic.sensing.feature_noise=-2px", "feature_noise must be at least 0"),
-        ("kinematic.sensing.feature_noise=2kg", "feature_noise must be a number in m, cm, mm, px, got '2kg'"),
-        ("ukf_mfac.aids.feature_noise=2px", "aids.feature_noise must be a number in m, cm, mm, got '2px'"),
+        (
+            "kinematic.sensing.feature_noise=2kg",
+            "feature_noise must be a number in m, cm, mm, px, got '2kg'",
+        ),
+        (
+            "ukf_mfac.aids.feature_noise=2px",
+            "aids.feature_noise must be a number in m, cm, mm, got '2px'",
+        ),
     ],
 )
 def test_a_refusal_is_in_the_unit_that_was_written(assignment, message):
@@ -82,13 +100,18 @@ def test_a_rare_value_is_used_with_one_remark(caplog):
         assert read("kinematic.max_joint_speed=57").max_joint_speed == 57.0
         read("kinematic.max_joint_speed=57")
     (line,) = caplog.messages
-    assert "kinematic.max_joint_speed is 57, and usually at most 20 rad/s; if 57deg/s is meant, write the unit" in line
+    assert (
+        "kinematic.max_joint_speed is 57, and usually at most 20 rad/s; if 57deg/s is meant, write the unit"
+        in line
+    )
 
 
 def test_pixels_are_pixels_where_features_are():
     config = SensingConfig(feature_noise="2px", quantum="1px")
     assert config.extents("px", 160.0)[:4] == (0.0125, 0.02, 0.00625, 0.05)
-    with pytest.raises(ValueError, match=r"sensing.feature_noise is 2px, but the features are in m; write it in m"):
+    with pytest.raises(
+        ValueError, match=r"sensing.feature_noise is 2px, but the features are in m; write it in m"
+    ):
         config.extents("m", 1.0)
 
 

@@ -7,7 +7,15 @@ from typing import Literal
 
 import pytest
 
-from servobench.plant.contract.settings import Count, Number, Periods, Positive, Share, nested, settings
+from servobench.plant.contract.settings import (
+    Count,
+    Number,
+    Periods,
+    Positive,
+    Share,
+    nested,
+    settings,
+)
 from servobench.plant.robot.camera import PinholeCamera
 
 

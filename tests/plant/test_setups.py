@@ -23,7 +23,9 @@ MODELS = WORDS[1:]  # the first one is the arm's own model, which has tests of i
 SEVERE = Mismatch.parse("severe+gear_ratio=5%")
 
 
-def true_model(word: str, seed: int = 0, mismatch: Mismatch = SEVERE, robot: str = "ur5") -> SetupModel:
+def true_model(
+    word: str, seed: int = 0, mismatch: Mismatch = SEVERE, robot: str = "ur5"
+) -> SetupModel:
     arm = find_robot(robot)
     true, sample = sample_mismatch(mismatch, arm, seed)
     model, _ = Sensing.parse(word).true(arm, true, sample, mismatch, seed)
@@ -49,26 +51,37 @@ def test_feature_and_jacobian_are_those_of_casadi(word):
             continue
         checked += 1
         np.testing.assert_allclose(np.asarray(function(posture))[:, 0], y, rtol=1e-12, atol=1e-10)
-        np.testing.assert_allclose(np.asarray(derivative(posture)), J, rtol=1e-10, atol=1e-9 * model.channel.scale)
+        np.testing.assert_allclose(
+            np.asarray(derivative(posture)), J, rtol=1e-10, atol=1e-9 * model.channel.scale
+        )
     assert checked >= 1
 
 
-@pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])
+@pytest.mark.parametrize(
+    "word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"]
+)
 def test_pixels_are_those_of_opencv(word):
     model = true_model(word)
     for posture in postures(5):
         points = model.points(posture)
         wanted = []
         for c, camera in enumerate(model.cameras):
-            f, centre, k = (value[c] for value in (model.optics.focal, model.optics.centre, model.optics.distortion))
+            f, centre, k = (
+                value[c]
+                for value in (model.optics.focal, model.optics.centre, model.optics.distortion)
+            )
             R = camera[:3, :3].T
             if ((points - camera[:3, 3]) @ camera[:3, 2] < 0.1).any():
                 break
             K = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
-            pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(R)[0], -R @ camera[:3, 3], K, np.array([k, 0.0, 0, 0]))
+            pixels, _ = cv2.projectPoints(
+                points, cv2.Rodrigues(R)[0], -R @ camera[:3, 3], K, np.array([k, 0.0, 0, 0])
+            )
             wanted.append(pixels.reshape(-1))
         else:
-            np.testing.assert_allclose(model.feature(posture), np.concatenate(wanted), rtol=1e-9, atol=1e-8)
+            np.testing.assert_allclose(
+                model.feature(posture), np.concatenate(wanted), rtol=1e-9, atol=1e-8
+            )
 
 
 def test_position_by_a_fixed_camera_is_the_arms_own_model():
@@ -111,7 +124,8 @@ def test_a_metre_across_the_sight_changes_a_pixel_by_the_scale(word):
     pose, step = model.cameras[0], 1e-6
     ahead = pose[:3, 3] + model.distance * pose[:3, 2]
     there, here = (
-        model.feature_at((ahead + side * pose[:3, 0])[None].repeat(len(model.target), 0)) for side in (step, 0.0)
+        model.feature_at((ahead + side * pose[:3, 0])[None].repeat(len(model.target), 0))
+        for side in (step, 0.0)
     )
     np.testing.assert_allclose((there - here)[0] / step, model.channel.scale, rtol=1e-6)
 
@@ -121,7 +135,9 @@ def test_cameras_on_the_hand_do_not_see_how_the_base_stands():
     model = true_model("plate:hand")
     q = find_robot("ur5").workspace.home
     turn = 0.4
-    R = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    R = np.array(
+        [[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+    )
     turned = replace(model, target=model.target @ R.T)
     moved = q + turn / model.arm.gear_ratio * (np.arange(6) == 0)
     np.testing.assert_allclose(turned.feature(moved), model.feature(q), rtol=1e-10)
@@ -139,7 +155,9 @@ def test_a_lane_has_the_bits_of_a_single_run(word):
 
 def test_what_is_behind_the_camera_or_out_of_the_image_is_not_seen():
     optics = Optics(np.array([200.0]), np.array([[160.0, 120.0]]), np.zeros(1), (320.0, 240.0))
-    points = np.array([[[0, 0, 1], [0, 0, -1.0], [0.79, 0, 1], [0.81, 0, 1], [0, 0.61, 1]]], dtype=float)
+    points = np.array(
+        [[[0, 0, 1], [0, 0, -1.0], [0.79, 0, 1], [0.81, 0, 1], [0, 0.61, 1]]], dtype=float
+    )
     assert in_image(points, optics).tolist() == [[True, False, True, False, False]]
     assert np.isfinite(project(points, optics)).all()
 
@@ -154,7 +172,16 @@ def test_only_the_disc_that_leaves_the_image_is_lost_and_none_is_seen_from_behin
     square = np.array([[-0.1, -0.1, 0.65], [0.1, -0.1, 0.65], [0.1, 0.1, 0.65], [-0.1, 0.1, 0.65]])
     assert all(seen(square))
     half = 0.65 * CAMERA.width / (2 * CAMERA.focal)
-    assert seen(square + [half - 0.05, 0, 0]) == [True, True, False, False, False, False, True, True]
+    assert seen(square + [half - 0.05, 0, 0]) == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
     assert not any(seen(square[::-1]))
 
 
@@ -177,7 +204,9 @@ def test_draws_of_the_optics_stay_within_their_magnitudes_and_do_not_depend_on_t
     assert np.abs(centre).max() > 7.8
     assert (mount <= np.radians(4)).all()
     assert mount.max() > np.radians(3.9)
-    np.testing.assert_allclose(np.linalg.norm([each.turn[1] for each in two], axis=-1), np.radians(30))
+    np.testing.assert_allclose(
+        np.linalg.norm([each.turn[1] for each in two], axis=-1), np.radians(30)
+    )
     one = draw_cameras(mismatch, 1, 7)
     assert one.focal[0] == two[7].focal[0]
     np.testing.assert_array_equal(one.centre[0], two[7].centre[0])
@@ -198,7 +227,9 @@ def test_a_camera_that_is_moved_turns_about_what_it_looks_at(word):
     model = Sensing.parse(word).nominal(robot)
     moved = model.turned(np.array([0.0, 0.0, 0.7]), robot.workspace.centre)
     pivot = model.pivot(robot.workspace.centre)
-    np.testing.assert_allclose(moved.feature_at(pivot[None])[:2], model.feature_at(pivot[None])[:2], rtol=1e-9)
+    np.testing.assert_allclose(
+        moved.feature_at(pivot[None])[:2], model.feature_at(pivot[None])[:2], rtol=1e-9
+    )
     np.testing.assert_array_equal(moved.cameras[1:], model.cameras[1:])
     assert not np.allclose(moved.camera, model.camera)
 
@@ -227,7 +258,9 @@ def test_an_axis_that_the_cameras_do_not_have_is_refused():
 def test_a_plate_needs_six_joints(tmp_path):
     file = tmp_path / "four.toml"
     file.write_text(FOUR_JOINTS)
-    with pytest.raises(ValueError, match="sensing plate needs an arm of 6 joints or more, and .* has 4"):
+    with pytest.raises(
+        ValueError, match="sensing plate needs an arm of 6 joints or more, and .* has 4"
+    ):
         Sensing.parse("plate").nominal(find_robot(str(file)))
 
 
@@ -239,7 +272,10 @@ def in_place(points, optics):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"measure": in_place, "rates": None}, "measure and rates must not change their arguments; work on a copy"),
+        (
+            {"measure": in_place, "rates": None},
+            "measure and rates must not change their arguments; work on a copy",
+        ),
         (
             {"measure": lambda points, _: points[0, 0, :2]},
             r"measure must return .* of shape \(5, 2\) for points \(5, 1, 1, 3\), .* got float64 of shape \(1, 3\)",
@@ -248,15 +284,27 @@ def in_place(points, optics):
             {"measure": lambda points, _: np.ma.masked_less(points[..., 0, 0, :2], 0.5)},
             "measure must return .*, got MaskedArray",
         ),
-        ({"measure": lambda points, _: points[..., 0, 0, :2].tolist()}, "measure must return .*, got list"),
+        (
+            {"measure": lambda points, _: points[..., 0, 0, :2].tolist()},
+            "measure must return .*, got list",
+        ),
         (
             {"measure": lambda points, _: points[..., 0, 0, :2].astype(np.float16)},
             "measure must return .*, got float16",
         ),
         ({"features": ()}, "features must be one name or more, got none"),
-        ({"measure": lambda points, _: np.nan * points[..., 0, 0, :2]}, "measure must return finite numbers, got .nan"),
-        ({"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]}, r"rates must return .* shape \(5, 2, 2\) for"),
-        ({"rates": lambda *given: 1.01 * SETUPS["pixel"].rates(*given)}, "rates is not the derivative of measure"),
+        (
+            {"measure": lambda points, _: np.nan * points[..., 0, 0, :2]},
+            "measure must return finite numbers, got .nan",
+        ),
+        (
+            {"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]},
+            r"rates must return .* shape \(5, 2, 2\) for",
+        ),
+        (
+            {"rates": lambda *given: 1.01 * SETUPS["pixel"].rates(*given)},
+            "rates is not the derivative of measure",
+        ),
     ],
 )
 def test_functions_that_break_their_contract_are_refused(changes, message):
@@ -265,15 +313,22 @@ def test_functions_that_break_their_contract_are_refused(changes, message):
     for setup in SETUPS.values():
         setup.check()
     with pytest.raises(FloatingPointError, match="invalid value"):
-        replace(SETUPS["pixel"], measure=lambda points, _: np.log(points[..., 0, 0, :2] - 9.0)).check()
+        replace(
+            SETUPS["pixel"], measure=lambda points, _: np.log(points[..., 0, 0, :2] - 9.0)
+        ).check()
 
 
 def test_lengths_have_a_natural_size_and_other_units_need_one_and_single_features_a_point():
     for unit, metre in (("mm", 1000.0), ("cm", 100.0), ("m", 1.0)):
         assert replace(SETUPS["position"], unit=unit).channel(500.0, 2.0).scale == metre
-    with pytest.raises(ValueError, match="sensing position: features in rad need their natural size; give scale="):
+    with pytest.raises(
+        ValueError, match="sensing position: features in rad need their natural size; give scale="
+    ):
         replace(SETUPS["position"], unit="rad")
-    with pytest.raises(ValueError, match="sensing stereo: single needs as many features for each of 2 points, got 3"):
+    with pytest.raises(
+        ValueError,
+        match="sensing stereo: single needs as many features for each of 2 points, got 3",
+    ):
         replace(SETUPS["stereo"], features=("u1", "v1", "u2"))
 
 
@@ -285,8 +340,15 @@ def test_features_without_a_derivative_are_differentiated():
     motions = rng.normal(size=(4, 1, 1, 3, 6))
     optics = Optics(np.array([200.0]), np.array([[160.0, 120.0]]), np.array([0.05]), (320.0, 240.0))
     wanted = exact.change(points, motions, optics)
-    np.testing.assert_allclose(numeric.change(points, motions, optics), wanted, rtol=1e-6, atol=1e-5)
-    wrapped = replace(numeric, measure=lambda *given: exact.measure(*given) % 1.0)  # which is no lack of precision
-    np.testing.assert_allclose(wrapped.change(points, motions, optics), wanted, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(
+        numeric.change(points, motions, optics), wanted, rtol=1e-6, atol=1e-5
+    )
+    # Which is no lack of precision
+    wrapped = replace(numeric, measure=lambda *given: exact.measure(*given) % 1.0)
+    np.testing.assert_allclose(
+        wrapped.change(points, motions, optics), wanted, rtol=1e-6, atol=1e-5
+    )
     single = replace(numeric, measure=lambda *given: exact.measure(*given).astype(np.float32))
-    assert np.abs(single.change(points, motions, optics) - wanted).max() < 1e-3 * np.abs(wanted).max()
+    assert (
+        np.abs(single.change(points, motions, optics) - wanted).max() < 1e-3 * np.abs(wanted).max()
+    )

@@ -53,13 +53,17 @@ def test_a_number_is_held_against_its_bounds():
     ],
 )  # fmt: skip
 def test_none_and_a_text_for_names_are_refused_by_their_argument(make):
-    with pytest.raises(ValueError, match=r"(must be real numbers|names .* must be lists|must be Channels), got"):
+    with pytest.raises(
+        ValueError, match=r"(must be real numbers|names .* must be lists|must be Channels), got"
+    ):
         make()
 
 
 def test_a_period_is_a_whole_number_of_own_steps():
     assert whole_steps(0.05, 1 / 240) == 12
-    with pytest.raises(ValueError, match=r"whole multiple of the plant's own step of 0.00416666667 s, got 0.051 s"):
+    with pytest.raises(
+        ValueError, match=r"whole multiple of the plant's own step of 0.00416666667 s, got 0.051 s"
+    ):
         whole_steps(0.051, 1 / 240)
     with pytest.raises(ValueError, match="whole multiple"):
         whole_steps(-0.05, 1 / 240)
@@ -67,7 +71,10 @@ def test_a_period_is_a_whole_number_of_own_steps():
 
 def test_each_feature_says_whether_it_is_valid():
     assert Observation(0.0, np.zeros(1), np.zeros(2)).valid.tolist() == [True, True]
-    assert Observation(0.0, np.zeros(1), np.zeros(2), feature_valid=False).valid.tolist() == [False, False]
+    assert Observation(0.0, np.zeros(1), np.zeros(2), feature_valid=False).valid.tolist() == [
+        False,
+        False,
+    ]
     partial = Observation(0.0, np.zeros(1), np.zeros(2), valid=np.array([True, False]))
     assert (partial.valid.tolist(), partial.feature_valid) == ([True, False], False)
     with pytest.raises(ValueError, match=r"valid must have shape \(2,\), got \(1,\)"):
@@ -92,13 +99,22 @@ def test_a_spec_describes_features_and_commands_as_channels():
     ],
 )
 def test_a_channel_is_checked(change, message):
-    values = {"names": ("x",), "unit": "m", "scale": 1.0, "lower": np.array([-np.inf]), "upper": np.ones(1)}
+    values = {
+        "names": ("x",),
+        "unit": "m",
+        "scale": 1.0,
+        "lower": np.array([-np.inf]),
+        "upper": np.ones(1),
+    }
     with pytest.raises(ValueError, match=message):
         Channel(**(values | change))
 
 
 def test_command_limits_must_be_symmetric():
     one = np.ones(1)
-    feature, command = Channel(("x",), "m", 1.0, -one, one), Channel(("a",), "rad/s", 1.0, -2 * one, one)
+    feature, command = (
+        Channel(("x",), "m", 1.0, -one, one),
+        Channel(("a",), "rad/s", 1.0, -2 * one, one),
+    )
     with pytest.raises(ValueError, match="command limits must be symmetric"):
         PlantSpec(feature, command, -one, one, 0.1)

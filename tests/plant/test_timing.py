@@ -53,13 +53,17 @@ def build(request):
 def every(seen, rate):
     """Return joints and features at multiples of `COMMON`."""
     step = round(COMMON * rate)
-    return [np.array([getattr(o, name) for o in seen[::step]]) for name in ("joint_position", "feature")]
+    return [
+        np.array([getattr(o, name) for o in seen[::step]]) for name in ("joint_position", "feature")
+    ]
 
 
 @pytest.mark.parametrize("command_delay", [0.0, 0.05, 0.07])
 def test_the_physical_world_is_the_same_at_every_rate(build, command_delay):
     settings = {"command_delay": command_delay, "latency": 0.07}
-    walks = {rate: every(run(build(rate, **settings), rate), rate) for rate in (*RATES, *CAMERA_RATES)}
+    walks = {
+        rate: every(run(build(rate, **settings), rate), rate) for rate in (*RATES, *CAMERA_RATES)
+    }
     assert np.ptp(walks[250][0], axis=0).max() > 0.05
     for joints, features in walks.values():
         np.testing.assert_allclose(joints, walks[250][0], rtol=0.0, atol=1e-9)
@@ -70,7 +74,13 @@ def test_the_physical_world_is_the_same_at_every_rate(build, command_delay):
 @NEEDS_BULLET
 def test_the_rendered_world_is_the_same_at_two_rates():
     entry, walks = find_plant("bullet"), []
-    late = {"command_delay": 0.05, "latency": 0.07, "drop_probability": 0.0, "depth_noise": "none", "scenery": False}
+    late = {
+        "command_delay": 0.05,
+        "latency": 0.07,
+        "drop_probability": 0.0,
+        "depth_noise": "none",
+        "scenery": False,
+    }
     for rate in (10, 20):
         plant = entry.build(configure(entry.config, **late), setup("moderate", 1.0 / rate))
         walks.append(every(run(plant, rate), rate))
@@ -83,7 +93,9 @@ def test_the_rendered_world_is_the_same_at_two_rates():
 @NEEDS_BULLET
 @pytest.mark.parametrize("rate", [15, 29.97, 30, 90])
 def test_physics_steps_add_up_to_the_period(rate):
-    config = configure(RenderedConfig, lag=0.0, latency=0.0, scenery=False, drives=DriveConfig(dynamics=False))
+    config = configure(
+        RenderedConfig, lag=0.0, latency=0.0, scenery=False, drives=DriveConfig(dynamics=False)
+    )
     plant = find_plant("bullet").build(config, setup(period=1 / rate))
     start = plant.reset(3).joint_position
     moved = [plant.step(Command(np.full(6, 0.3))).joint_position - start for _ in range(3)]
@@ -94,10 +106,13 @@ def test_physics_steps_add_up_to_the_period(rate):
 @pytest.mark.parametrize("rate", RATES)
 def test_a_feature_is_late_by_exactly_the_latency(build, rate):
     late, fine = (
-        [o.feature for o in run(build(own, latency=latency), own)] for own, latency in ((rate, 0.033), (1000, 0.0))
+        [o.feature for o in run(build(own, latency=latency), own)]
+        for own, latency in ((rate, 0.033), (1000, 0.0))
     )
     instants = [round(1000 * k / rate) for k in range(len(late))]
-    np.testing.assert_allclose(late, [fine[max(0, ms - 33)] for ms in instants], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        late, [fine[max(0, ms - 33)] for ms in instants], rtol=0.0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -107,7 +122,9 @@ def test_a_slow_camera_shows_frames_of_its_own_clock_and_the_feature_is_held_bet
     held, last = fine[0], 0
     for k, observation in enumerate(seen[1:], 1):
         newest = (round(1000 * k / rate) - 20) // 40  # number of the newest frame that is delivered
-        assert observation.feature_valid == (newest > last or (newest == 0 and (k - 1) / rate < 0.02 <= k / rate))
+        assert observation.feature_valid == (
+            newest > last or (newest == 0 and (k - 1) / rate < 0.02 <= k / rate)
+        )
         held, last = fine[40 * newest] if newest > 0 else held, max(newest, last)
         np.testing.assert_allclose(observation.feature, held, rtol=0.0, atol=1e-9)
 
@@ -173,11 +190,15 @@ def test_a_command_acts_after_its_delay_to_within_half_a_millisecond(rate):
     np.testing.assert_allclose(seen.time - (seen.joint_position - start) / 0.3, 0.05, atol=0.0005)
 
 
-@pytest.mark.parametrize(("rate", "frames"), [(125, 30), (60, 30), (20, 29.97), (20, 15), (30, 24), (1000 / 3, 29.97)])
+@pytest.mark.parametrize(
+    ("rate", "frames"), [(125, 30), (60, 30), (20, 29.97), (20, 15), (30, 24), (1000 / 3, 29.97)]
+)
 def test_a_camera_keeps_its_own_rate_under_every_control_rate(monkeypatch, rate, frames):
     taken, see = [], KinematicWorld.see
     monkeypatch.setattr(KinematicWorld, "see", lambda world: taken.append(1) or see(world))
-    config = configure(KinematicConfig, command_delay=0.05, latency=0.083, frame_period=1 / frames, **QUIET)
+    config = configure(
+        KinematicConfig, command_delay=0.05, latency=0.083, frame_period=1 / frames, **QUIET
+    )
     plant = find_plant("kinematic").build(config, setup(period=1 / rate))
     plant.reset(3)
     for _ in range(round(20 * rate)):
@@ -188,14 +209,19 @@ def test_a_camera_keeps_its_own_rate_under_every_control_rate(monkeypatch, rate,
 def test_rounded_times_are_named_once(caplog):
     remark.cache_clear()
     for _ in range(2):
-        find_plant("kinematic").build(configure(KinematicConfig, command_delay=0.05, **QUIET), setup(period=1 / 29.97))
+        find_plant("kinematic").build(
+            configure(KinematicConfig, command_delay=0.05, **QUIET), setup(period=1 / 29.97)
+        )
     said = "command_delay: rounded to multiples of 0.981374 ms, 1/34 of the control period of 0.0333667 s"
     assert [said in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_a_bench_refuses_a_world_that_is_too_coarse():
     world = KinematicWorld(KinematicConfig(), setup(period=0.05))
-    with pytest.raises(ValueError, match=r"latency must be a multiple of the world's period of 0\.05 s, got 0\.02 s"):
+    with pytest.raises(
+        ValueError,
+        match=r"latency must be a multiple of the world's period of 0\.05 s, got 0\.02 s",
+    ):
         Bench(world, 0.05, SensingConfig(latency=0.02))
 
 

@@ -33,7 +33,8 @@ def test_a_key_of_many_parts_is_refused_at_once(kind, tmp_path):
     (tmp_path / "bomb.toml").write_text(BOMBS[kind])
     began = time.process_time()
     with pytest.raises(
-        ConfigurationError, match=f"^robot file .* the key .* has more than {MAX_KEY_PARTS} parts; nest no"
+        ConfigurationError,
+        match=f"^robot file .* the key .* has more than {MAX_KEY_PARTS} parts; nest no",
     ):
         read_toml("robot file", tmp_path / "bomb.toml")
     assert time.process_time() - began < 2.0
@@ -41,15 +42,20 @@ def test_a_key_of_many_parts_is_refused_at_once(kind, tmp_path):
 
 @pytest.mark.parametrize("line", ["k{}.b = 1", "[k{}]", "k{} = 1", "[[k{}.c]]"])
 def test_many_short_lines_are_refused_at_once(line):
-    with pytest.raises(ValueError, match="letters beside texts and comments; at most 500000 are read"):
+    with pytest.raises(
+        ValueError, match="letters beside texts and comments; at most 500000 are read"
+    ):
         parse_toml("\n".join(map(line.format, range(MANY))))
 
 
-@pytest.mark.parametrize("where", ['"{}" = 1', "'{}'.b = 1", '["{}"]', 'a = [{{b = {{"{}" = 1}}}}]'])
+@pytest.mark.parametrize(
+    "where", ['"{}" = 1', "'{}'.b = 1", '["{}"]', 'a = [{{b = {{"{}" = 1}}}}]']
+)
 def test_a_long_key_in_quotes_is_refused(where):
     parse_toml(where.format("k" * MAX_KEY))
     with pytest.raises(
-        ValueError, match=f"the key kkkkkkkkkkkkkkkkkkkk… has {MAX_KEY + 1} letters; at most {MAX_KEY} are"
+        ValueError,
+        match=f"the key kkkkkkkkkkkkkkkkkkkk… has {MAX_KEY + 1} letters; at most {MAX_KEY} are",
     ):
         parse_toml(where.format("k" * (MAX_KEY + 1)))
 

@@ -60,7 +60,9 @@ def test_seed_0_has_the_mean_and_controllers_know_the_named_robot(twin):
 
 def test_seeds_draw_parameters_with_their_joint_uncertainty(twin):
     own = find_robot(twin).twin
-    drawn = np.array([[own.values(seed)[name] for name in own.keys.parameters] for seed in range(1, 4001)])
+    drawn = np.array(
+        [[own.values(seed)[name] for name in own.keys.parameters] for seed in range(1, 4001)]
+    )
     factor = np.array(own.keys.factor)
     np.testing.assert_allclose(drawn.mean(axis=0), (0.083, 0.05, 0.0), atol=1e-3)
     np.testing.assert_allclose(np.cov(drawn.T), factor.T @ factor, atol=3e-5)
@@ -72,12 +74,16 @@ def test_the_plant_has_the_times_and_the_noise_of_the_twin(twin):
     plant = experiment.plant
     plant.reset(0)
     rest = [plant.step(Command(np.zeros(6))).feature for _ in range(4000)][10:]
-    np.testing.assert_allclose(np.cov(np.transpose(rest)), find_robot(twin).twin.keys.covariance, atol=4e-7)
+    np.testing.assert_allclose(
+        np.cov(np.transpose(rest)), find_robot(twin).twin.keys.covariance, atol=4e-7
+    )
     assert resolve(request(twin), Settings()).plant.sensing.latency == 0.083
     assert resolve(request(twin), Settings()).plant.command_delay == 0.02
 
 
-@pytest.mark.parametrize(("rate", "frame_period"), [(20.0, 0.0), (10.0, 0.1), (15.0, 1.0 / 15.0), (40.0, 0.0)])
+@pytest.mark.parametrize(
+    ("rate", "frame_period"), [(20.0, 0.0), (10.0, 0.1), (15.0, 1.0 / 15.0), (40.0, 0.0)]
+)
 def test_frames_at_the_control_rate_are_as_late_as_the_log_says(tmp_path, rate, frame_period):
     """A grid of frames would round the latency of 83 ms up to the next control instant."""
     robot = written(tmp_path, TWIN.replace("latency = 0.083", f"latency = 0.083\nrate = {rate}"))
@@ -85,13 +91,21 @@ def test_frames_at_the_control_rate_are_as_late_as_the_log_says(tmp_path, rate, 
 
 
 def test_gears_and_sensor_of_a_twin_are_settings_of_its_plant(tmp_path):
-    robot = written(tmp_path, TWIN + "[plant.mechanics]\nbacklash = 0.01\n[plant.sensing]\njitter = 0.1\n")
+    robot = written(
+        tmp_path, TWIN + "[plant.mechanics]\nbacklash = 0.01\n[plant.sensing]\njitter = 0.1\n"
+    )
     plant = resolve(request(robot), Settings()).plant
-    assert (plant.mechanics.backlash, plant.sensing.jitter, plant.sensing.latency) == (0.01, 0.1, 0.083)
+    assert (plant.mechanics.backlash, plant.sensing.jitter, plant.sensing.latency) == (
+        0.01,
+        0.1,
+        0.083,
+    )
 
 
 def test_latency_is_drawn_to_a_millisecond_unless_a_user_sets_it(twin):
-    drawn = {seed: resolve(request(twin, seed), Settings()).plant.sensing.latency for seed in range(6)}
+    drawn = {
+        seed: resolve(request(twin, seed), Settings()).plant.sensing.latency for seed in range(6)
+    }
     assert len(set(drawn.values())) > 3
     assert all(latency == round(latency, 3) for latency in drawn.values())
     given = Settings({"kinematic": {"sensing": {"latency": 0.1}}})
@@ -101,7 +115,9 @@ def test_latency_is_drawn_to_a_millisecond_unless_a_user_sets_it(twin):
 
 
 def test_runs_on_a_twin_have_the_same_noise_side_by_side_and_alone(twin):
-    runs = [resolve(request(twin, seed, varied=(("latency", 0.05),)), Settings()) for seed in (1, 2)]
+    runs = [
+        resolve(request(twin, seed, varied=(("latency", 0.05),)), Settings()) for seed in (1, 2)
+    ]
     both = build_together(runs).plant
     seen = both.reset([1, 2]).feature
     np.testing.assert_array_equal(seen[1], build(runs[1]).plant.reset(2).feature)
@@ -112,13 +128,18 @@ def test_a_deviating_camera_in_pixels_shows_the_marker_elsewhere():
     nominal, q = Sensing.parse("pixel").nominal(robot), robot.workspace.home
     moved = deviated(nominal, {"focal": 0.1, "centre_u": 3.0})
     middle = nominal.optics.centre[0]
-    np.testing.assert_allclose(moved.feature(q), middle + 1.1 * (nominal.feature(q) - middle) + (3.0, 0.0))
+    np.testing.assert_allclose(
+        moved.feature(q), middle + 1.1 * (nominal.feature(q) - middle) + (3.0, 0.0)
+    )
     longer = deviated(nominal, {"tool_z": 0.05})
     np.testing.assert_allclose(np.linalg.norm(longer.points(q) - nominal.points(q)), 0.05)
 
 
 BROKEN = {
-    "zero_elbow = 0.05": ("zero_elbo = 0.05", "has no parameter 'zero_elbo' there; did you mean 'zero_elbow'"),
+    "zero_elbow = 0.05": (
+        "zero_elbo = 0.05",
+        "has no parameter 'zero_elbo' there; did you mean 'zero_elbow'",
+    ),
     "pose = {": ("rate = 20.0 # {", 'camera.pose must have frame = "base"'),
     ", [0.0, 0.01, -0.01]]": (", [0.0]]", "each row of factor needs 3 numbers"),
     "4e-6": ("-4e-6", "covariance must be a symmetric, positive definite matrix"),
@@ -137,7 +158,11 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path, old):
 
 def test_parameters_in_other_units_are_remarked_on(tmp_path, caplog):
     cases = [
-        ("zero_elbow = 0.05", "zero_elbow = 2.9", "zero_elbow deviates by 2.9, and usually by 0.5 at most"),
+        (
+            "zero_elbow = 0.05",
+            "zero_elbow = 2.9",
+            "zero_elbow deviates by 2.9, and usually by 0.5 at most",
+        ),
         ("tool_x = 0.013", "tool_x = 13", "tool_x deviates by 13"),
         ("[0.004,", "[4.0,", "latency deviates by 4"),
     ]
@@ -165,14 +190,21 @@ def test_a_twin_finds_its_robot_beside_itself(tmp_path, monkeypatch, name):
     path = written(tmp_path, own)
     monkeypatch.chdir(tmp_path.parent)
     assert find_robot(path).n == 4
-    assert with_files("my arm.urdf#tool0 with camera.toml", str.upper) == "MY ARM.URDF#tool0 with CAMERA.TOML"
+    assert (
+        with_files("my arm.urdf#tool0 with camera.toml", str.upper)
+        == "MY ARM.URDF#tool0 with CAMERA.TOML"
+    )
 
 
 @pytest.mark.parametrize("mismatch", ["moderate", "tool=20mm"])
 def test_a_twin_has_no_mismatch_of_its_robot(twin, mismatch):
-    with pytest.raises(ConfigurationError, match="draws its robot from a posterior: leave the mismatch out"):
+    with pytest.raises(
+        ConfigurationError, match="draws its robot from a posterior: leave the mismatch out"
+    ):
         true_robot(twin, mismatch=mismatch)
-    np.testing.assert_array_equal(true_robot(twin, mismatch="outliers=5%").camera, true_robot(twin).camera)
+    np.testing.assert_array_equal(
+        true_robot(twin, mismatch="outliers=5%").camera, true_robot(twin).camera
+    )
 
 
 def test_another_sensing_than_that_of_the_log_is_refused(twin):

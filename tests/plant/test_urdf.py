@@ -20,7 +20,9 @@ from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.catalogue import find_robot
 
-pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
+pybullet = pytest.importorskip(
+    "pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
+)
 
 UR5 = find_robot("ur5")
 BALL = 7  # link number: six joints, the flange, the ball
@@ -47,7 +49,9 @@ def loaded(arm, tmp_path):
     def link_state(q, link):
         for joint, angle in enumerate(arm.joint_angle(q)):
             pybullet.resetJointState(body, joint, angle, physicsClientId=client)
-        return pybullet.getLinkState(body, link, computeForwardKinematics=True, physicsClientId=client)
+        return pybullet.getLinkState(
+            body, link, computeForwardKinematics=True, physicsClientId=client
+        )
 
     link_state.dynamics = lambda link: pybullet.getDynamicsInfo(body, link, physicsClientId=client)
     yield link_state
@@ -71,7 +75,9 @@ def test_the_centres_of_mass_are_those_of_the_data_sheet_in_the_dh_frames(arm, l
     q = np.random.default_rng(2).uniform(-np.pi, np.pi, 6)
     for link, (frame, centre) in enumerate(zip(arm.frames(q), ur5.CENTRE_OF_MASS, strict=False)):
         in_joint = rotation_from_rpy(arm.rpy[link + 1]) @ centre + arm.translation[link + 1]
-        np.testing.assert_allclose(loaded(q, link)[0], frame[:3, :3] @ in_joint + frame[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(
+            loaded(q, link)[0], frame[:3, :3] @ in_joint + frame[:3, 3], atol=1e-6
+        )
 
 
 def test_masses_and_inertias_arrive_in_the_simulator(loaded):
@@ -95,7 +101,11 @@ def shapes(urdf, kind) -> list[tuple[str, str, str]]:
     for link in ET.fromstring(urdf).iter("link"):
         for part in link.findall(kind):
             geometry = part.find("geometry")[0]
-            what = dict(geometry.attrib) if geometry.tag != "mesh" else {"radius": geometry.get("scale").split()[0]}
+            what = (
+                dict(geometry.attrib)
+                if geometry.tag != "mesh"
+                else {"radius": geometry.get("scale").split()[0]}
+            )
             parts.append((link.get("name"), str(part.find("origin").attrib), str(what)))
     return parts
 
@@ -111,16 +121,23 @@ def test_nothing_but_the_ball_is_reddish():
     robot = arm_tree(ur5.ur5_arm(), UR5)
     bench = ET.fromstring(bench_files()["bench.urdf"])
     for visual in [*robot.iter("visual"), *bench.iter("visual")]:
-        red, green, blue, _ = (float(part) for part in visual.find("material/color").get("rgba").split())
+        red, green, blue, _ = (
+            float(part) for part in visual.find("material/color").get("rgba").split()
+        )
         is_ball = (
-            visual.find("geometry/mesh") is not None and visual.find("geometry/mesh").get("filename") == "ball.obj"
+            visual.find("geometry/mesh") is not None
+            and visual.find("geometry/mesh").get("filename") == "ball.obj"
         )
         assert (red > 2 * max(green, blue)) == is_ball
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -2), (1, 0, 0), (0.3, -0.4, 0.1), (-1, -1, -1)])
+@pytest.mark.parametrize(
+    "direction", [(0, 0, 1), (0, 0, -2), (1, 0, 0), (0.3, -0.4, 0.1), (-1, -1, -1)]
+)
 def test_rpy_along_turns_z_into_the_direction(direction):
-    turned = pybullet.getMatrixFromQuaternion(pybullet.getQuaternionFromEuler(rpy_along(direction).tolist()))
+    turned = pybullet.getMatrixFromQuaternion(
+        pybullet.getQuaternionFromEuler(rpy_along(direction).tolist())
+    )
     np.testing.assert_allclose(
         np.reshape(turned, (3, 3))[:, 2], np.array(direction) / np.linalg.norm(direction), atol=1e-7
     )
@@ -130,7 +147,9 @@ def read_obj(text) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (k, 3) and triangles, counted from 0, of a Wavefront OBJ file."""
     rows = [line.split() for line in text.splitlines()]
     vertices = np.array([[float(x) for x in row[1:]] for row in rows if row[0] == "v"])
-    return vertices, np.array([[int(x.split("//")[0]) - 1 for x in row[1:]] for row in rows if row[0] == "f"])
+    return vertices, np.array(
+        [[int(x.split("//")[0]) - 1 for x in row[1:]] for row in rows if row[0] == "f"]
+    )
 
 
 def test_the_sphere_is_closed_round_and_turned_outwards():
@@ -163,6 +182,13 @@ def test_a_gear_ratio_of_zero_is_refused():
 
 
 def test_an_arm_with_another_number_of_joints_is_refused():
-    arm = SerialArm(("one",), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.array([0.0, 0.0, 0.1]))
+    arm = SerialArm(
+        ("one",),
+        np.zeros((2, 3)),
+        np.zeros((2, 3)),
+        np.zeros(1),
+        np.ones(1),
+        np.array([0.0, 0.0, 0.1]),
+    )
     with pytest.raises(ValueError, match="arm must have 6 joints like the UR5, got 1"):
         arm_tree(arm, UR5)

@@ -21,7 +21,11 @@ from servobench.plant.robot.urdf_file import _arm, _limits, _links, read_urdf_ro
 pytest.importorskip("yourdfpy")
 
 ODD = odd_urdf()
-ORIGIN, AXIS, LIMIT = '<origin xyz="0.35 0 0" rpy="0 0.2 0"/>', '<axis xyz="0 -1 0"/>', 'lower="-1.5" upper="1.5"'
+ORIGIN, AXIS, LIMIT = (
+    '<origin xyz="0.35 0 0" rpy="0 0.2 0"/>',
+    '<axis xyz="0 -1 0"/>',
+    'lower="-1.5" upper="1.5"',
+)
 INERTIAL = '<inertial><mass value="2"/><inertia ixx="0.02" iyy="0.02" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
 HEAVY = re.sub(r'<link name="(\w+)"/>', rf'<link name="\1">{INERTIAL}</link>', ODD)
 
@@ -69,7 +73,9 @@ def test_a_quaternion_turns_an_inertia_as_its_rpy(tmp_path):
         return links_of(tmp_path, text)[0].inertia
 
     turn = " ".join(map(repr, Rotation.from_euler("xyz", [0.4, -0.3, 1.1]).as_quat().tolist()))
-    np.testing.assert_allclose(inertia(f'quat_xyzw="{turn}"'), inertia('rpy="0.4 -0.3 1.1"'), atol=1e-12)
+    np.testing.assert_allclose(
+        inertia(f'quat_xyzw="{turn}"'), inertia('rpy="0.4 -0.3 1.1"'), atol=1e-12
+    )
 
 
 JOINT = '<joint name="joint_9" type="fixed"><parent link="foot"/><child link="link_9"/></joint>'
@@ -95,31 +101,79 @@ JOINT = '<joint name="joint_9" type="fixed"><parent link="foot"/><child link="li
                 'rpy="0 nan 0"': "rpy has 'nan', which is no number",
             }.items()
         ),
-        (ORIGIN, "<Origin xyz='0.35 0 0'/>", "joint 'joint_4': joint has the element <Origin>; valid: .*origin"),
+        (
+            ORIGIN,
+            "<Origin xyz='0.35 0 0'/>",
+            "joint 'joint_4': joint has the element <Origin>; valid: .*origin",
+        ),
         (ORIGIN, "<orgin xyz='0.35 0 0'/>", "joint 'joint_4': joint has the element <orgin>"),
         (ORIGIN, "<pose>0.35 0 0 0 0.2 0</pose>", "joint 'joint_4': joint has the element <pose>"),
         (ORIGIN, "<origin>0.35 0 0</origin>", "joint 'joint_4': origin holds the text '0.35 0 0'"),
         (ORIGIN, f"{ORIGIN}<origin/>", "joint 'joint_4': joint has two different <origin>"),
-        (ORIGIN, f"<parent link='link_3'>{ORIGIN}</parent>", "joint 'joint_4': parent has the element <origin>"),
-        (f"{ORIGIN}<axis", f"<axis>{ORIGIN}</axis><axis", "joint 'joint_4': axis has the element <origin>"),
-        ('name="joint_4"', 'name="joint_4" origin="0.35 0 0"', "joint 'joint_4': joint has the attribute 'origin'"),
+        (
+            ORIGIN,
+            f"<parent link='link_3'>{ORIGIN}</parent>",
+            "joint 'joint_4': parent has the element <origin>",
+        ),
+        (
+            f"{ORIGIN}<axis",
+            f"<axis>{ORIGIN}</axis><axis",
+            "joint 'joint_4': axis has the element <origin>",
+        ),
+        (
+            'name="joint_4"',
+            'name="joint_4" origin="0.35 0 0"',
+            "joint 'joint_4': joint has the attribute 'origin'",
+        ),
         (AXIS, "<axis/>", "joint 'joint_2': axis has no xyz"),
         (AXIS, '<axis XYZ="0 -1 0"/>', "joint 'joint_2': axis has the attribute 'XYZ'"),
         (AXIS, '<Axis xyz="0 -1 0"/>', "joint 'joint_2': joint has the element <Axis>"),
-        (AXIS, f'{AXIS}<mimic joint="joint_1" ratio="2"/>', "joint 'joint_2': mimic has the attribute 'ratio'"),
+        (
+            AXIS,
+            f'{AXIS}<mimic joint="joint_1" ratio="2"/>',
+            "joint 'joint_2': mimic has the attribute 'ratio'",
+        ),
         (AXIS, f"{AXIS}<mimic/>", "joint 'joint_2': mimic has no joint"),
         (LIMIT, 'min="-1.5" max="1.5"', "joint 'joint_2': limit has the attribute 'min'"),
         (LIMIT, f'{LIMIT} unit="deg"', "joint 'joint_2': limit has the attribute 'unit'"),
-        (LIMIT, 'lower="-1,5" upper="1.5"', "joint 'joint_2': limit lower has '-1,5', which is no number"),
-        ('name="joint_2" type="revolute"', 'name="joint_2" type="Revolute"', "'Revolute'; did you mean 'revolute'"),
+        (
+            LIMIT,
+            'lower="-1,5" upper="1.5"',
+            "joint 'joint_2': limit lower has '-1,5', which is no number",
+        ),
+        (
+            'name="joint_2" type="revolute"',
+            'name="joint_2" type="Revolute"',
+            "'Revolute'; did you mean 'revolute'",
+        ),
         ('name="joint_2"', 'name="joint_1"', "there is more than one joint 'joint_1'"),
-        ('<link name="link_4"/>', '<link name="link_4"/>' * 2, "there is more than one link 'link_4'"),
+        (
+            '<link name="link_4"/>',
+            '<link name="link_4"/>' * 2,
+            "there is more than one link 'link_4'",
+        ),
         ('<parent link="foot"/>', "", "joint 'joint_1' has no <parent>"),
         ('<child link="link_1"/>', "<child/>", "joint 'joint_1': child has no link"),
-        ('<link name="link_4"/>', f'<link name="link_4">{JOINT}</link>', "link 'link_4': link has the element <joint>"),
-        ("</robot>", "<Joint name='joint_9'/></robot>", "<Joint> in line 1 is no element of a URDF"),
-        ("</robot>", f"<joints>{JOINT}</joints></robot>", "<joints> in line 1 is no element of a URDF"),
-        ("</robot>", f"<group>{JOINT}</group></robot>", "<group> in line 1 is no element of a URDF"),
+        (
+            '<link name="link_4"/>',
+            f'<link name="link_4">{JOINT}</link>',
+            "link 'link_4': link has the element <joint>",
+        ),
+        (
+            "</robot>",
+            "<Joint name='joint_9'/></robot>",
+            "<Joint> in line 1 is no element of a URDF",
+        ),
+        (
+            "</robot>",
+            f"<joints>{JOINT}</joints></robot>",
+            "<joints> in line 1 is no element of a URDF",
+        ),
+        (
+            "</robot>",
+            f"<group>{JOINT}</group></robot>",
+            "<group> in line 1 is no element of a URDF",
+        ),
         (
             "</robot>",
             f"{JOINT.replace('link_9', 'link_2')}</robot>",
@@ -127,8 +181,16 @@ JOINT = '<joint name="joint_9" type="fixed"><parent link="foot"/><child link="li
         ),
         ('<robot name="odd">', "<robot>", "<robot> has no name"),
         ('<robot name="odd">', "<sdf>", "is no URDF: "),
-        ('<mass value="2"/>', '<mass value="2kg"/>', "link 'foot': mass value has '2kg', which is no number"),
-        ("<inertial>", "<inertial><Origin xyz='0 0 1'/>", "link 'foot': inertial has the element <Origin>"),
+        (
+            '<mass value="2"/>',
+            '<mass value="2kg"/>',
+            "link 'foot': mass value has '2kg', which is no number",
+        ),
+        (
+            "<inertial>",
+            "<inertial><Origin xyz='0 0 1'/>",
+            "link 'foot': inertial has the element <Origin>",
+        ),
     ],
 )
 def test_what_may_carry_geometry_and_is_not_known_is_refused_by_name(tmp_path, old, new, message):
@@ -142,11 +204,23 @@ def test_what_may_carry_geometry_and_is_not_known_is_refused_by_name(tmp_path, o
     ("old", "new", "message"),
     [
         (AXIS, '<axis xyz="0 -1 0" rpy="0 0 0"/>', "rpy of <axis>, which is left out"),
-        (AXIS, f'{AXIS}<joint_properties damping="0.2"/>', "<joint_properties> in <joint>, which is left out"),
+        (
+            AXIS,
+            f'{AXIS}<joint_properties damping="0.2"/>',
+            "<joint_properties> in <joint>, which is left out",
+        ),
         (LIMIT, f'{LIMIT} current="10"', "current of <limit>, which is left out"),
-        ("<inertial>", '<inertial><density value="2"/>', "<density> in <inertial>, which is left out"),
+        (
+            "<inertial>",
+            '<inertial><density value="2"/>',
+            "<density> in <inertial>, which is left out",
+        ),
         ('ixx="0.02" ', "", "inertia without ixx in link 'foot'"),
-        ('<link name="link_4"/>', '<link name="link_4"><origin xyz="0 0 1"/></link>', "<origin> in <link>, which"),
+        (
+            '<link name="link_4"/>',
+            '<link name="link_4"><origin xyz="0 0 1"/></link>',
+            "<origin> in <link>, which",
+        ),
         ("</robot>", '<link name="stray"/></robot>', "links without a joint are left out: stray"),
         *(
             ("</robot>", f"{other}</robot>", "")
@@ -158,7 +232,11 @@ def test_what_may_carry_geometry_and_is_not_known_is_refused_by_name(tmp_path, o
             )
         ),
         (LIMIT, f'{LIMIT} drake:acceleration="3" jerk="1"', ""),
-        ("<robot ", '\n<?xml version="1.0"?><robot xmlns="http://a.org" xmlns:xacro="http://a.org/xacro" ', ""),
+        (
+            "<robot ",
+            '\n<?xml version="1.0"?><robot xmlns="http://a.org" xmlns:xacro="http://a.org/xacro" ',
+            "",
+        ),
         *(
             ('<link name="link_4"/>', f'<link name="link_4"><{use}>{shape}</{use}></link>', "")
             for use in ("visual", "collision")
@@ -176,7 +254,9 @@ def test_what_may_carry_geometry_and_is_not_known_is_refused_by_name(tmp_path, o
 def test_what_carries_no_geometry_is_left_out(tmp_path, caplog, old, new, message):
     text = ODD if old in ODD else HEAVY
     assert old in text
-    np.testing.assert_array_equal(flange(chain_of(tmp_path, text.replace(old, new))), flange(chain_of(tmp_path, ODD)))
+    np.testing.assert_array_equal(
+        flange(chain_of(tmp_path, text.replace(old, new))), flange(chain_of(tmp_path, ODD))
+    )
     assert message in caplog.text
     assert bool(message) == bool(caplog.text)
 
@@ -190,26 +270,55 @@ def test_what_carries_no_geometry_is_left_out(tmp_path, caplog, old, new, messag
         ODD.replace("</robot>", '<xacro:gripper parent="hand"/></robot>'),
         ODD.replace("</robot>", '<x:gripper xmlns:x="http://www.ros.org/wiki/xacro"/></robot>'),
         ODD.replace("</robot>", '<include filename="hand.xacro"/></robot>'),
-        ODD.replace('<link name="hand"/>', '<link name="hand"><xacro:insert_block name="shape"/></link>'),
-        ODD.replace('<link name="hand"/>', '<link name="hand"><visual><mesh filename="$(find a)/b"/></visual></link>'),
+        ODD.replace(
+            '<link name="hand"/>', '<link name="hand"><xacro:insert_block name="shape"/></link>'
+        ),
+        ODD.replace(
+            '<link name="hand"/>',
+            '<link name="hand"><visual><mesh filename="$(find a)/b"/></visual></link>',
+        ),
     ],
 )
 def test_a_xacro_that_was_not_run_is_called_so(tmp_path, text):
-    with pytest.raises(ValueError, match="run xacro first, and give what it prints: `xacro FILE > arm.urdf`"):
+    with pytest.raises(
+        ValueError, match="run xacro first, and give what it prints: `xacro FILE > arm.urdf`"
+    ):
         chain_of(tmp_path, text)
-    with pytest.raises(ValueError, match="robot 'arm.urdf.xacro#hand' is a xacro file: run xacro first"):
+    with pytest.raises(
+        ValueError, match="robot 'arm.urdf.xacro#hand' is a xacro file: run xacro first"
+    ):
         find_robot("arm.urdf.xacro#hand")
 
 
 @pytest.mark.parametrize(
     ("limit", "wanted", "said"),
     [
-        ('lower="-inf" upper="inf"', (-2 * np.pi, 2 * np.pi, 2.0), "unlimited .* ±2π .*: lower of joint_2, upper of"),
-        ('lower="-1e308" upper="1e9"', (-2 * np.pi, 2 * np.pi, 2.0), "unlimited .* ±2π .*: lower of joint_2, upper of"),
+        (
+            'lower="-inf" upper="inf"',
+            (-2 * np.pi, 2 * np.pi, 2.0),
+            "unlimited .* ±2π .*: lower of joint_2, upper of",
+        ),
+        (
+            'lower="-1e308" upper="1e9"',
+            (-2 * np.pi, 2 * np.pi, 2.0),
+            "unlimited .* ±2π .*: lower of joint_2, upper of",
+        ),
         ('lower="-Infinity" upper="1"', (-2 * np.pi, 1.0, 2.0), "unlimited .*: lower of joint_2$"),
-        ('lower="-1.5"', (-1.5, 2 * np.pi, 2.0), "limits that the URDF lacks are taken as ±2π .*: upper of joint_2$"),
-        ('upper="2"', (-2 * np.pi, 2.0, 2.0), "limits that the URDF lacks are taken as ±2π .*: lower of joint_2$"),
-        ('lower="-20" upper="20"', (-20.0, 20.0, 2.0), "limits beyond ±4π rad; angles .* in rad: joint_2$"),
+        (
+            'lower="-1.5"',
+            (-1.5, 2 * np.pi, 2.0),
+            "limits that the URDF lacks are taken as ±2π .*: upper of joint_2$",
+        ),
+        (
+            'upper="2"',
+            (-2 * np.pi, 2.0, 2.0),
+            "limits that the URDF lacks are taken as ±2π .*: lower of joint_2$",
+        ),
+        (
+            'lower="-20" upper="20"',
+            (-20.0, 20.0, 2.0),
+            "limits beyond ±4π rad; angles .* in rad: joint_2$",
+        ),
     ],
 )
 def test_a_limit_that_is_given_is_kept_and_any_other_is_said(tmp_path, caplog, limit, wanted, said):
@@ -261,11 +370,26 @@ STROKE = '<limit lower="0" upper="0.05" effort="1" velocity="1"/>'
             "palm",
             r"drive \(mimicked by 1\).*#left wo",
         ),
-        ([*ARM, DRIVE[:2] + ("link_6", "left"), ("l", "revolute", "left", "tip", MIMIC)], 6, "link_6", "mimicked by 1"),
+        (
+            [*ARM, DRIVE[:2] + ("link_6", "left"), ("l", "revolute", "left", "tip", MIMIC)],
+            6,
+            "link_6",
+            "mimicked by 1",
+        ),
         ([*ARM, PALM, *PAIR], 6, "palm", r"left_f \(prismatic\), right_f \(prismatic\)"),
-        ([*ARM, PALM, *(("finger", "revolute", "palm", "tip"),)], 6, "palm", r"finger \(by its name\); #tip would"),
+        (
+            [*ARM, PALM, *(("finger", "revolute", "palm", "tip"),)],
+            6,
+            "palm",
+            r"finger \(by its name\); #tip would",
+        ),
         ([*ARM, PALM, ("gripper_controller", "revolute", "palm", "tip")], 6, "palm", "by its name"),
-        ([*ARM, PALM, ("6", "revolute", "palm", "moving_jaw")], 6, "palm", r"6 \(by its name\); #moving_jaw would"),
+        (
+            [*ARM, PALM, ("6", "revolute", "palm", "moving_jaw")],
+            6,
+            "palm",
+            r"6 \(by its name\); #moving_jaw would",
+        ),
         (
             [
                 *ARM,
@@ -298,17 +422,57 @@ STROKE = '<limit lower="0" upper="0.05" effort="1" velocity="1"/>'
             "alink_7",
             "as many joints lead to #b",
         ),
-        ([row for k in "ab" for row in arm_joints(6, k)], 6, "alink_6", "as many joints lead to #blink_6"),
+        (
+            [row for k in "ab" for row in arm_joints(6, k)],
+            6,
+            "alink_6",
+            "as many joints lead to #blink_6",
+        ),
         ([*ARM, ("camera", "revolute", "link_2", "eye")], 6, "link_6", "^$"),
         ([*ARM, ("pan", "revolute", "link_5", "eye")], 6, "link_6", "as many joints lead to #eye"),
-        ([*ARM, ("bar", "revolute", "link_3", "rod"), ("end", "revolute", "rod", "rod_end")], 6, "link_6", "^$"),
-        ([*ARM, ("bar", "revolute", "link_4", "rod"), ("end", "revolute", "rod", "rod_end")], 6, "link_6", "#rod_end"),
-        ([*ARM, ("bar", "revolute", "link_1", "rod", '<mimic joint="joint_2"/>')], 6, "link_6", "^$"),
-        ([*ARM, ("bar", "revolute", "link_3", "rod", '<mimic joint="joint_4"/>')], 6, "link_6", "^$"),
+        (
+            [*ARM, ("bar", "revolute", "link_3", "rod"), ("end", "revolute", "rod", "rod_end")],
+            6,
+            "link_6",
+            "^$",
+        ),
+        (
+            [*ARM, ("bar", "revolute", "link_4", "rod"), ("end", "revolute", "rod", "rod_end")],
+            6,
+            "link_6",
+            "#rod_end",
+        ),
+        (
+            [*ARM, ("bar", "revolute", "link_1", "rod", '<mimic joint="joint_2"/>')],
+            6,
+            "link_6",
+            "^$",
+        ),
+        (
+            [*ARM, ("bar", "revolute", "link_3", "rod", '<mimic joint="joint_4"/>')],
+            6,
+            "link_6",
+            "^$",
+        ),
         ([*ARM, ("a", "fixed", "link_6", "ft"), ("b", "fixed", "ft", "flange")], 6, "ft", "^$"),
-        ([*ARM, ("a", "fixed", "link_6", "ft"), ("b", "fixed", "link_6", "flange")], 6, "flange", "^$"),
-        ([*SHORT, DRIVE[:2] + ("link_3", "left"), ("l", "revolute", "left", "tip", MIMIC)], 3, "link_3", "mimicked"),
-        ([*SHORT[:2], DRIVE[:2] + ("link_2", "left"), ("l", "revolute", "link_2", "tip", MIMIC)], 3, "left", "^$"),
+        (
+            [*ARM, ("a", "fixed", "link_6", "ft"), ("b", "fixed", "link_6", "flange")],
+            6,
+            "flange",
+            "^$",
+        ),
+        (
+            [*SHORT, DRIVE[:2] + ("link_3", "left"), ("l", "revolute", "left", "tip", MIMIC)],
+            3,
+            "link_3",
+            "mimicked",
+        ),
+        (
+            [*SHORT[:2], DRIVE[:2] + ("link_2", "left"), ("l", "revolute", "link_2", "tip", MIMIC)],
+            3,
+            "left",
+            "^$",
+        ),
         ([*SHORT, (*QUILL, STROKE)], 3, "link_3", r"quill \(prismatic\)"),
     ],
 )
@@ -329,9 +493,18 @@ def test_a_link_of_the_tool_that_is_named_takes_its_joints(tmp_path):
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        ([*SHORT, QUILL], "'quill' after 'joint_3' is of type prismatic, which is not modelled; #link_3 leaves it out"),
-        ([*SHORT, QUILL, ("turn", "revolute", "tip", "end")], "'quill' on the way to 'end' is of type prismatic"),
-        ([("rail", "prismatic", "world", "base"), *ARM], "'rail' on the way to 'link_6' is of type prismatic"),
+        (
+            [*SHORT, QUILL],
+            "'quill' after 'joint_3' is of type prismatic, which is not modelled; #link_3 leaves it out",
+        ),
+        (
+            [*SHORT, QUILL, ("turn", "revolute", "tip", "end")],
+            "'quill' on the way to 'end' is of type prismatic",
+        ),
+        (
+            [("rail", "prismatic", "world", "base"), *ARM],
+            "'rail' on the way to 'link_6' is of type prismatic",
+        ),
         (
             [
                 *SHORT,
@@ -340,7 +513,10 @@ def test_a_link_of_the_tool_that_is_named_takes_its_joints(tmp_path):
             ],
             r"'level' on the way to 'end' turns with another \(mimic\).*#link_3",
         ),
-        ([*ARM, ("a", "fixed", "x", "y"), ("b", "fixed", "y", "x")], "the joints before link 'x' form a circle"),
+        (
+            [*ARM, ("a", "fixed", "x", "y"), ("b", "fixed", "y", "x")],
+            "the joints before link 'x' form a circle",
+        ),
     ],
 )
 def test_an_axis_of_the_arm_that_is_not_modelled_is_refused(tmp_path, joints, message):
@@ -357,7 +533,10 @@ def test_an_axis_of_the_arm_that_is_not_modelled_is_refused(tmp_path, joints, me
         ),  # kg mm²
         ('ixx="200" iyy="200" izz="100"', "inertia is implausible"),  # kg cm²
         ('ixx="68.3" iyy="68.3" izz="34.2"', "inertia is implausible"),  # lb in²
-        ('ixx="1e-12" iyy="1e-12" izz="1e-12"', "inertia is implausible, as its largest moment is 1e-12 kg m²"),
+        (
+            'ixx="1e-12" iyy="1e-12" izz="1e-12"',
+            "inertia is implausible, as its largest moment is 1e-12 kg m²",
+        ),
         ('ixx="2e-5" iyy="2e-5" izz="1e-5"', "inertia is implausible"),  # t m²
         ('ixx="1e-12" iyy="1e-12" izz="0.1"', "no body has the principal moments"),
         ('ixx="-0.02" iyy="0.02" izz="0.01"', "inertia must be positive definite"),

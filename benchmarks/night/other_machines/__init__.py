@@ -45,7 +45,11 @@ def machines() -> tuple[Machine, ...]:
     zig = "" if importlib.util.find_spec("ziglang") else "zig, pip install ziglang"
     qemu, wine = shutil.which("qemu-aarch64"), shutil.which("wine64") or shutil.which("wine")
     loader = Path(ARM_LIBRARIES, "lib", "ld-linux-aarch64.so.1").exists()
-    arm = "" if qemu and loader else "qemu-aarch64 and the C library of ARM, apt install qemu-user libc6-arm64-cross"
+    arm = (
+        ""
+        if qemu and loader
+        else "qemu-aarch64 and the C library of ARM, apt install qemu-user libc6-arm64-cross"
+    )
     windows = "" if wine else "wine, apt install wine64"
     return (
         Machine(PLATFORMS["aarch64-linux"], (qemu or "", "-L", ARM_LIBRARIES), zig or arm),
@@ -85,20 +89,42 @@ def drive(
     Raises:
         AssertionError: the driver was not compiled or said that something failed.
     """
-    platform, command = (this_platform(), ()) if machine is None else (machine.platform, machine.command)
+    platform, command = (
+        (this_platform(), ()) if machine is None else (machine.platform, machine.command)
+    )
     identifier, version = made.description.model_identifier, made.fmi_version
     library = unpacked / "binaries" / platform.folder(version) / f"{identifier}{platform.suffix}"
     program = unpacked / f"drive-{platform.name}.exe"
     build = [shutil.which("cc")] if machine is None else [sys.executable, "-m", "ziglang", "cc"]
     target = [] if machine is None else ["-target", platform.zig_target]
     system = [] if platform.suffix == ".dll" else ["-ldl"]
-    options = [f"-DFMI_VERSION={version}", "-I", str(unpacked / "sources"), "-O2", "-o", str(program)]
+    options = [
+        f"-DFMI_VERSION={version}",
+        "-I",
+        str(unpacked / "sources"),
+        "-O2",
+        "-o",
+        str(program),
+    ]
     done = carried_out(*build, *target, HERE / "drive.c", *options, *system)
     assert done.returncode == 0, done.stderr[:2000]
     head = np.array([step, first, inputs.shape[1]])
-    (unpacked / "inputs").write_bytes(np.concatenate([head, np.ravel(inputs)]).astype("<f8").tobytes())
-    environment = {**os.environ, "WINEPREFIX": str(home or unpacked), "WINEDEBUG": "-all", "DISPLAY": ""}
-    words = [*command, f"./{program.name}", f"./{library.relative_to(unpacked).as_posix()}", "inputs", "outputs"]
+    (unpacked / "inputs").write_bytes(
+        np.concatenate([head, np.ravel(inputs)]).astype("<f8").tobytes()
+    )
+    environment = {
+        **os.environ,
+        "WINEPREFIX": str(home or unpacked),
+        "WINEDEBUG": "-all",
+        "DISPLAY": "",
+    }
+    words = [
+        *command,
+        f"./{program.name}",
+        f"./{library.relative_to(unpacked).as_posix()}",
+        "inputs",
+        "outputs",
+    ]
     done = carried_out(*words, cwd=unpacked, env=environment, timeout=600, errors="replace")
     assert done.returncode == 0, f"{words}: exit code {done.returncode}: {done.stderr[:2000]}"
     return np.frombuffer((unpacked / "outputs").read_bytes(), "<f8").reshape(len(inputs), -1)

@@ -53,7 +53,15 @@ def build(folder: Path, made: Product, defect: str = "") -> Path:
     shutil.copy(HERE / "calls.h", sources)
     shutil.copy(HERE / f"calls{version}.c", sources)
     files = [f"calls{version}.c", *made.description.sources]
-    command = [shutil.which("cc") or "cc", *COMMON, *SANITIZED, *files, "-o", str(folder / "calls"), "-lm"]
+    command = [
+        shutil.which("cc") or "cc",
+        *COMMON,
+        *SANITIZED,
+        *files,
+        "-o",
+        str(folder / "calls"),
+        "-lm",
+    ]
     subprocess.run(command, cwd=sources, check=True)
     return folder / "calls"
 

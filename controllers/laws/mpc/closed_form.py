@@ -137,7 +137,9 @@ class UnlimitedPlan:
     | `travel` | S = travel · dq, the way after each move | (moves, moves) | 1 |
     """
 
-    def __init__(self, coupling: FloatArray, pull: FloatArray, travel: FloatArray, move_weight: FloatArray) -> None:
+    def __init__(
+        self, coupling: FloatArray, pull: FloatArray, travel: FloatArray, move_weight: FloatArray
+    ) -> None:
         """Diagonalise the coupling.
 
         Args:
@@ -226,7 +228,9 @@ class Blocks:
         Args:
             delay: from now to the begin of the first block [s].
         """
-        return np.array([in_periods(delay + t * self.length, self.period) for t in range(self.count + 1)])
+        return np.array(
+            [in_periods(delay + t * self.length, self.period) for t in range(self.count + 1)]
+        )
 
 
 def bridging_shares(delay: float, period: float) -> FloatArray:

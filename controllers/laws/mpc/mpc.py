@@ -8,12 +8,26 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law, Stage
 from servobench.controllers.laws.mpc import closed_form
-from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver, exceeds, joint_bounds, view_rows
+from servobench.controllers.laws.mpc.qp import (
+    QpBounds,
+    QpProgram,
+    QpShape,
+    Solver,
+    exceeds,
+    joint_bounds,
+    view_rows,
+)
 from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.stages.finish import scale_to_limit
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.lanes import branch, norm, where
-from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.settings import (
+    Count,
+    NonNegative,
+    Positive,
+    PositiveOrInfinite,
+    settings,
+)
 from servobench.plant.contract.signals import BoolArray, Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
@@ -59,7 +73,9 @@ class MpcConfig:
     def __post_init__(self) -> None:
         """Check across fields."""
         if len(self.view_tangent) not in (0, 2):
-            raise ValueError(f"view_tangent must be empty or (horizontal, vertical), got {self.view_tangent}")
+            raise ValueError(
+                f"view_tangent must be empty or (horizontal, vertical), got {self.view_tangent}"
+            )
 
 
 class Plan(NamedTuple):
@@ -130,17 +146,27 @@ class MpcLaw(Law[MpcState]):
         if config.view_tangent and spec.m != 3:
             raise ValueError(f"view_tangent needs the 3 features x, y, z, got {spec.m} features")
         if config.forgetting * blocks.length > _MAX_FORGETTING:
-            most = f"at most {_MAX_FORGETTING / blocks.length:g} 1/s for blocks of {blocks.length:g} s"
-            raise ValueError(f"forgetting must be {most}, or no error ahead counts; got {config.forgetting:g} 1/s")
+            most = (
+                f"at most {_MAX_FORGETTING / blocks.length:g} 1/s for blocks of {blocks.length:g} s"
+            )
+            raise ValueError(
+                f"forgetting must be {most}, or no error ahead counts; got {config.forgetting:g} 1/s"
+            )
         self._config, self._spec, self._blocks = config, spec, blocks
-        own: dict[Stage, bool] = {"limit": True, "preview": config.use_preview, "predict": config.delay > 0.0}
+        own: dict[Stage, bool] = {
+            "limit": True,
+            "preview": config.use_preview,
+            "predict": config.delay > 0.0,
+        }
         self.owns = frozenset(stage for stage, brought in own.items() if brought)
         self._places = blocks.places(config.delay)
         self._to_come = closed_form.bridging_shares(config.delay, spec.period)[:, None]
         constant, horizon = config.mode == "constant", blocks.count
         weight = as_array("joint_weight", config.joint_weight or np.ones(spec.n), (spec.n,))
         # One constant velocity is weighted once, not in every block.
-        self._Q: FloatArray = config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
+        self._Q: FloatArray = (
+            config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
+        )
         self._terminal = config.terminal_weight / blocks.relative_length
         rho, alpha = config.decay * blocks.length, math.exp(-config.forgetting * blocks.length)
         self._shares = closed_form.decay_shares(horizon, rho)
@@ -154,7 +180,9 @@ class MpcLaw(Law[MpcState]):
             move_weight=self._Q,
             constant_gain=gain if constant else None,
             largest_move=spec.joint_velocity_limit * blocks.length,
-            largest_change=self._change * blocks.length if math.isfinite(config.joint_acceleration_limit) else None,
+            largest_change=self._change * blocks.length
+            if math.isfinite(config.joint_acceleration_limit)
+            else None,
             limit_position=config.limit_position,
             view_rows=view_rows(config.view_tangent, spec.m),
         )
@@ -197,26 +225,36 @@ class MpcLaw(Law[MpcState]):
         last = state.last * self._blocks.periods, self._change * self._spec.period
         bounds = joint_bounds(self._shape, self._spec, last, observation.joint_position, margin)
         lead = feature.shape[:-1]
-        plan = Plan(moves, success=np.ones(lead), iterations=np.zeros(lead), active_limits=np.zeros(lead))
-        plan = branch(exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds)
+        plan = Plan(
+            moves, success=np.ones(lead), iterations=np.zeros(lead), active_limits=np.zeros(lead)
+        )
+        plan = branch(
+            exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds
+        )
         limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan.moves[..., 0, :] / self._blocks.length, -limit, limit)
         fallbacks = np.asarray(state.fallbacks + (1.0 - plan.success))
         final = error + ahead[..., -1, :]
         return MpcState(state.sent, state.last, fallbacks, J, targets, final, plan), velocity
 
-    def restrained(self, state: MpcState, wanted: FloatArray, joint_velocity: FloatArray) -> FloatArray:
+    def restrained(
+        self, state: MpcState, wanted: FloatArray, joint_velocity: FloatArray
+    ) -> FloatArray:
         """Return the velocity with as much of the stages' addition as the acceleration limit leaves room for."""
         if self._shape.largest_change is None:
             return joint_velocity
         added, period = joint_velocity - wanted, self._spec.period
-        change = self._config.joint_acceleration_limit * period - np.sign(added) * (wanted - state.last / period)
+        change = self._config.joint_acceleration_limit * period - np.sign(added) * (
+            wanted - state.last / period
+        )
         return wanted + scale_to_limit(added, np.maximum(change, _MIN_ROOM))
 
     def noted(self, state: MpcState, joint_velocity: FloatArray, limited: BoolArray) -> MpcState:
         """Return the state with the step that is sent; see `Law.noted`."""
         last = joint_velocity * self._spec.period
-        return state._replace(sent=np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :], last=last)
+        return state._replace(
+            sent=np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :], last=last
+        )
 
     def _look_ahead(
         self, sent: FloatArray, J: FloatArray, observation: Observation, reference: FloatArray
@@ -224,7 +262,11 @@ class MpcLaw(Law[MpcState]):
         """Return ŷ, e and r_1 … r_H, all at the instant when a command first acts."""
         feature = observation.feature + np.matvec(J, np.add.reduce(self._to_come * sent, axis=-2))
         if not self._config.use_preview:
-            return feature, reference[..., 0, :] - feature, np.zeros((self._blocks.count, self._spec.m))
+            return (
+                feature,
+                reference[..., 0, :] - feature,
+                np.zeros((self._blocks.count, self._spec.m)),
+            )
         rows = sampled(reference, self._places)
         return feature, rows[..., 0, :] - feature, rows[..., 1:, :] - rows[..., :1, :]
 
@@ -250,7 +292,9 @@ class MpcLaw(Law[MpcState]):
         effort = 0.5 * (self._Q * moves**2).sum(axis=(-2, -1))
         if shape.constant_gain is not None:
             step = moves @ J.mT
-            return np.asarray(effort + (0.5 * shape.constant_gain * step**2 - targets * step).sum(axis=(-2, -1)))
+            return np.asarray(
+                effort + (0.5 * shape.constant_gain * step**2 - targets * step).sum(axis=(-2, -1))
+            )
         miss = targets - np.cumsum(moves, axis=-2) @ J.mT
         return np.asarray(effort + 0.5 * (shape.weights[:, None] * miss**2).sum(axis=(-2, -1)))
 
@@ -259,7 +303,9 @@ class MpcLaw(Law[MpcState]):
         targets = closed_form.decay_targets(error, ahead, self._shares)
         if self._config.mode == "moves":
             return targets
-        integral = (self._integrals.b - self._integrals.c) * error + np.vecmat(self._preview_weights, ahead)
+        integral = (self._integrals.b - self._integrals.c) * error + np.vecmat(
+            self._preview_weights, ahead
+        )
         terminal = self._terminal * self._blocks.count * targets[..., -1, :]
         return np.asarray((integral + terminal)[..., None, :])
 
@@ -267,7 +313,9 @@ class MpcLaw(Law[MpcState]):
         """Return the best plan within the limits."""
         signature = "(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()"
         # numpy.vectorize takes one lane after the other
-        solve = self._solve if plan.moves.ndim == 2 else np.vectorize(self._solve, signature=signature)
+        solve = (
+            self._solve if plan.moves.ndim == 2 else np.vectorize(self._solve, signature=signature)
+        )
         return Plan(*map(np.asarray, solve(plan.moves, J, targets, *bounds)))
 
     def _solve(
@@ -279,5 +327,7 @@ class MpcLaw(Law[MpcState]):
             active = np.count_nonzero(np.abs(solution.multiplier) > _MIN_MULTIPLIER)
             return solution.moves, 1.0, solution.iterations, float(active)
         hold = self._config.fallback == "hold"
-        step = np.zeros(self._spec.n) if hold else scale_to_limit(moves[0], self._shape.largest_move)
+        step = (
+            np.zeros(self._spec.n) if hold else scale_to_limit(moves[0], self._shape.largest_move)
+        )
         return np.tile(step, (len(moves), 1)), 0.0, solution.iterations, math.nan

@@ -53,7 +53,9 @@ class QpShape:
     largest_change: FloatArray | None
     limit_position: bool  # whether the joint positions are limited
     view_rows: FloatArray  # V, (v, m); no rows = no limit on the view
-    varying_jacobian: bool = False  # whether every block has a Jacobian of its own; for free moves only
+    varying_jacobian: bool = (
+        False  # whether every block has a Jacobian of its own; for free moves only
+    )
 
     def __eq__(self, other: object) -> bool:
         """Return whether all entries are equal."""
@@ -65,7 +67,9 @@ class QpShape:
 
     def _key(self) -> tuple[object, ...]:
         parts = (getattr(self, field.name) for field in fields(self))
-        return tuple((part.shape, part.tobytes()) if isinstance(part, np.ndarray) else part for part in parts)
+        return tuple(
+            (part.shape, part.tobytes()) if isinstance(part, np.ndarray) else part for part in parts
+        )
 
     @property
     def n(self) -> int:
@@ -150,7 +154,9 @@ def joint_bounds(
     )
 
 
-def exceeds(shape: QpShape, bounds: QpBounds, J: FloatArray, plan: FloatArray, travel: FloatArray) -> BoolArray:
+def exceeds(
+    shape: QpShape, bounds: QpBounds, J: FloatArray, plan: FloatArray, travel: FloatArray
+) -> BoolArray:
     """Return whether a plan breaks any limit, (...).
 
     Args:
@@ -166,7 +172,9 @@ def exceeds(shape: QpShape, bounds: QpBounds, J: FloatArray, plan: FloatArray, t
         broken = broken | _any((first > bounds.first_upper) | (first < bounds.first_lower), axis=-1)
         broken = broken | _any(np.abs(changes) > shape.largest_change, axis=(-2, -1))
     if shape.limit_position:
-        beyond = (travel > bounds.travel_upper[..., None, :]) | (travel < bounds.travel_lower[..., None, :])
+        beyond = (travel > bounds.travel_upper[..., None, :]) | (
+            travel < bounds.travel_lower[..., None, :]
+        )
         broken = broken | _any(beyond, axis=(-2, -1))
     if len(shape.view_rows):
         moved = travel @ (shape.view_rows @ J).mT
@@ -199,7 +207,8 @@ class QpProgram:
         self._targets = np.zeros(self._function.numel_in(1))
         self._H, self._g, self._c = np.zeros((count, count)), np.zeros(count), np.zeros(1)
         self._A = np.zeros((self._function.numel_out(3) // count, count))
-        self._buffer, self._evaluate = self._function.buffer()  # keep both: the evaluation does not hold the buffer
+        # Keep both: the evaluation does not hold the buffer
+        self._buffer, self._evaluate = self._function.buffer()
         for i, array in enumerate((self._J, self._targets)):
             self._buffer.set_arg(i, array.data)
         for i, array in enumerate((self._H, self._g, self._c, self._A)):
@@ -225,12 +234,24 @@ class QpProgram:
         # Rows beyond the reach of all moves within their limits cost time only.
         reach = np.abs(self._A) @ self._largest
         near = (row_lower > -reach) | (row_upper < reach)
-        lower, upper = np.concatenate([lower, row_lower[near]]), np.concatenate([upper, row_upper[near]])
-        x, value, multiplier, status, iterations = self._solve(self._H, self._g, self._A[near], lower, upper)
+        lower, upper = (
+            np.concatenate([lower, row_lower[near]]),
+            np.concatenate([upper, row_upper[near]]),
+        )
+        x, value, multiplier, status, iterations = self._solve(
+            self._H, self._g, self._A[near], lower, upper
+        )
         success = not status and bool(np.isfinite(x).all())
         if self._raises and not success:
             raise SolverFailed(f"{self._solver} found no solution within the limits: {status}")
-        return QpSolution(success, x.reshape(-1, n), value + float(self._c[0]), multiplier, status, float(iterations))
+        return QpSolution(
+            success,
+            x.reshape(-1, n),
+            value + float(self._c[0]),
+            multiplier,
+            status,
+            float(iterations),
+        )
 
     def _row_bounds(self, bounds: QpBounds) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of the rows in the order in which `_matrices` stacks them."""
@@ -248,26 +269,38 @@ class QpProgram:
 _Answer: TypeAlias = tuple[FloatArray, float, FloatArray, str, int]
 
 
-def _solve_daqp(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray) -> _Answer:
+def _solve_daqp(
+    H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray
+) -> _Answer:
     x, value, flag, information = daqp.solve(H, g, A, upper, lower, **_DAQP_OPTIONS)
     status = "" if flag == 1 else _DAQP_STATUS.get(flag, f"exit flag {flag}")
     return x, value, information["lam"], status, information["iterations"]
 
 
-def _solve_qpoases(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray) -> _Answer:
+def _solve_qpoases(
+    H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray
+) -> _Answer:
     """Solve with a new solver each time, because qpOASES starts from the working set of the last solve."""
     import casadi  # noqa: PLC0415 - other methods start without it
 
     n = len(g)
     structure = {"h": casadi.Sparsity.dense(n, n), "a": casadi.Sparsity.dense(len(A), n)}
     options: dict[str, Any] = {"error_on_fail": False, "print_time": False, **_QPOASES_OPTIONS}
-    with contextlib.redirect_stdout(io.StringIO()):  # qpOASES prints a banner when it is made and first used
+    with contextlib.redirect_stdout(
+        io.StringIO()
+    ):  # qpOASES prints a banner when it is made and first used
         solver = casadi.conic("mpc", "qpoases", structure, options)
         found = solver(h=H, g=g, a=A, lbx=lower[:n], ubx=upper[:n], lba=lower[n:], uba=upper[n:])
     statistics = solver.stats()
     multiplier = np.concatenate([np.asarray(found[name]).ravel() for name in ("lam_x", "lam_a")])
     status = "" if statistics["success"] else str(statistics["return_status"])
-    return np.asarray(found["x"]).ravel(), float(found["cost"]), multiplier, status, statistics["iter_count"]
+    return (
+        np.asarray(found["x"]).ravel(),
+        float(found["cost"]),
+        multiplier,
+        status,
+        statistics["iter_count"],
+    )
 
 
 @lru_cache(maxsize=16)

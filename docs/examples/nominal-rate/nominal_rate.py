@@ -4,7 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
+from servobench.controllers.controller import (
+    Controller,
+    ControllerEntry,
+    Diagnostics,
+    RobotKnowledge,
+)
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.laws.pid import PidConfig, PidLaw
@@ -55,7 +60,9 @@ class NominalRate(Controller):
         return self._jacobian  # optional; the log compares it with the true one
 
 
-ENTRY = ControllerEntry("nominal_rate", "resolved rate by the nominal Jacobian", NominalRateConfig, NominalRate)
+ENTRY = ControllerEntry(
+    "nominal_rate", "resolved rate by the nominal Jacobian", NominalRateConfig, NominalRate
+)
 
 
 @dataclass(frozen=True)
@@ -96,9 +103,15 @@ class NominalBroyden(Estimator[FloatArray]):
 def build_broyden(config: NominalBroydenConfig, knowledge: RobotKnowledge) -> ServoController:
     """Compose the estimator with a law and a provider of the initial Jacobian."""
     estimator, law = NominalBroyden(config.step_factor, knowledge), PidLaw(config.law, knowledge)
-    return ServoController(Servo(estimator, law, initial_jacobian(config.initial, knowledge), knowledge))
+    return ServoController(
+        Servo(estimator, law, initial_jacobian(config.initial, knowledge), knowledge)
+    )
 
 
 BROYDEN_ENTRY = ControllerEntry(
-    "nominal_broyden", "Broyden around the model", NominalBroydenConfig, build_broyden, side_by_side=True
+    "nominal_broyden",
+    "Broyden around the model",
+    NominalBroydenConfig,
+    build_broyden,
+    side_by_side=True,
 )

@@ -25,7 +25,9 @@ class Planar(World):
 
     def __init__(self, setup: PlantSetup) -> None:
         limit, stop = np.ones(2), np.full(2, 3.0)
-        self.spec = PlantSpec.of_joints(("shoulder", "elbow"), ("x", "y"), limit, -stop, stop, setup.period)
+        self.spec = PlantSpec.of_joints(
+            ("shoulder", "elbow"), ("x", "y"), limit, -stop, stop, setup.period
+        )
 
     def reset(self, seed: int) -> FloatArray:
         self._q = np.array([0.3, 1.2])

@@ -50,7 +50,12 @@ NEGLIGIBLE = 0.01  # [1] of the first error; rounding and slow learning may make
 DURATION = 20.0  # [s]
 MAX_LATENCY = 3.0  # [s] largest latency that is tried
 MAX_GAIN = 32.0  # largest factor that is tried
-LEFT_OUT = ("sensing.jitter", "sensing.latency_swing", "mechanics.backlash", "mechanics.tool_frequency")
+LEFT_OUT = (
+    "sensing.jitter",
+    "sensing.latency_swing",
+    "mechanics.backlash",
+    "mechanics.tool_frequency",
+)
 TIME_DIGITS = 9  # decimal places of a latency [s] that is tried
 STEP = 1e-6  # of a difference, in the unit of each number: a micrometre, a microradian
 RANK_TOLERANCE = 1e-6  # [1] a direction that is reached less than this counts as not reached
@@ -70,21 +75,30 @@ class FrozenEstimation:
     def __init__(self, estimation: Estimation, jacobian: JacobianFunction) -> None:
         """Take the stages, of which the pair stage goes on to remember joint positions, and the Jacobian."""
         self.pairing, self._jacobian = estimation.pairing, jacobian
-        self.into_model_frame = estimation.into_model_frame  # of the Jacobian that was learned before
+        # of the Jacobian that was learned before
+        self.into_model_frame = estimation.into_model_frame
 
-    def ahead(self, state: EstimationState, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def ahead(
+        self, state: EstimationState, joint_position: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the Jacobian at joint positions (..., n), twice; see `Estimation.ahead`."""
         jacobian = np.broadcast_to(self._jacobian(joint_position), state.jacobian.shape)
         return jacobian, jacobian
 
     def motion(
-        self, state: EstimationState, begin: FloatArray, joint_step: FloatArray, predicted: FloatArray
+        self,
+        state: EstimationState,
+        begin: FloatArray,
+        joint_step: FloatArray,
+        predicted: FloatArray,
     ) -> FloatArray:
         """Return the motion of the feature, which is `predicted`."""
         del state, begin, joint_step
         return predicted
 
-    def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
+    def update(
+        self, state: EstimationState, observation: Observation, desired: FloatArray
+    ) -> EstimationState:
         """Return the state at an observation; see `Estimation.update`."""
         del desired
         q, learned = observation.joint_position, state.learned
@@ -104,7 +118,11 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     other.estimation = FrozenEstimation(servo.estimation, jacobian)  # type: ignore[assignment]
     if pairing is not None:
         pair = learned.pair
-        other.predictor = None if servo.predictor is None else servo.predictor.frozen(float(pair.regression.share))
+        other.predictor = (
+            None
+            if servo.predictor is None
+            else servo.predictor.frozen(float(pair.regression.share))
+        )
         window = 0 if servo.predictor is None else servo.predictor.window
         rows = max(int(pairing.delay(pair)) + 4, window + 1)
         learned = learned._replace(pair=pair._replace(past=pair.past[:rows]))
@@ -120,7 +138,9 @@ class Rest:
     time: float  # of the next step [s]
     preview: int  # future rows of the reference
 
-    def observation(self, feature: FloatArray, joint_position: FloatArray, after: float = 0.0) -> Observation:
+    def observation(
+        self, feature: FloatArray, joint_position: FloatArray, after: float = 0.0
+    ) -> Observation:
         """Return the observation of other values, (..., m) and (..., n), `after` [s] later."""
         seen = np.full(feature.shape, fill_value=True)
         valid: Any = seen.all(axis=-1)
@@ -147,7 +167,9 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
 
     def stepped(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         measured = rest.observation(rest.feature + w[:, :m], rest.joint_position + w[:, m : m + n])
-        new, u = servo.step(packing.unpack(x), measured, rest.reference(rest.feature + w[:, m + n :]))
+        new, u = servo.step(
+            packing.unpack(x), measured, rest.reference(rest.feature + w[:, m + n :])
+        )
         return packing.pack(new, len(x)), u
 
     def differences(dx: FloatArray, dw: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -156,7 +178,9 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
         x = packing.centre + STEP * np.vstack([dx, -dx])
         new, u = stepped(x, STEP * np.vstack([dw, -dw]))
         with np.errstate(invalid="ignore"):
-            change = np.nan_to_num((new[:size] - new[size:]) / (2.0 * STEP), nan=0.0, posinf=0.0, neginf=0.0)
+            change = np.nan_to_num(
+                (new[:size] - new[size:]) / (2.0 * STEP), nan=0.0, posinf=0.0, neginf=0.0
+            )
         return change, (u[:size] - u[size:]) / (2.0 * STEP)
 
     inputs = np.eye(2 * m + n)
@@ -267,7 +291,9 @@ def warm_up(resolved: ResolvedRun) -> Warm:
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
     rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)
-    return Warm(controller, model, find_robot(resolved.request.robot).nominal, rest, arm, resolved.plant)
+    return Warm(
+        controller, model, find_robot(resolved.request.robot).nominal, rest, arm, resolved.plant
+    )
 
 
 def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> ArmModel:
@@ -280,11 +306,15 @@ def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> A
         ConfigurationError: joints that overshoot, which the model does not have.
     """
     if config.overshoot > 0.0:
-        raise ConfigurationError(f"kinematic.overshoot must be 0 for a linear model, got {config.overshoot:g}")
+        raise ConfigurationError(
+            f"kinematic.overshoot must be 0 for a linear model, got {config.overshoot:g}"
+        )
     age = max(config.sensing.frame_period - period, 0.0) / 2.0
     values = flatten(config)
     if out := [name for name in LEFT_OUT if values[name] > 0.0]:
-        remark(f"the linear model leaves out {', '.join(out)}: margins and limits are those without")
+        remark(
+            f"the linear model leaves out {', '.join(out)}: margins and limits are those without"
+        )
     return ArmModel(jacobian, period, config.lag, config.command_delay, config.sensing.latency, age)
 
 
@@ -300,9 +330,15 @@ def at_rest(warm: Warm, source: Source) -> tuple[Servo, ServoState, Rest]:
     """
     controller, rest = warm.controller, warm.rest
     if not isinstance(controller, ServoController) or controller.state is None:
-        raise TypeError(f"controller must be a ServoController after its warm-up, got {type(controller).__name__}")
+        raise TypeError(
+            f"controller must be a ServoController after its warm-up, got {type(controller).__name__}"
+        )
     state, q = controller.state, rest.joint_position
-    J = {"true": warm.arm.jacobian, "nominal": warm.nominal.jacobian(q), "estimated": state.jacobian}[source]
+    J = {
+        "true": warm.arm.jacobian,
+        "nominal": warm.nominal.jacobian(q),
+        "estimated": state.jacobian,
+    }[source]
     servo, state = frozen(controller.servo, state, lambda _: J)
     reference = rest.reference(rest.feature)
     period = warm.arm.period
@@ -352,11 +388,15 @@ class SmallLoop:
     def _features(self, factor: float, latency: float | None, offset: float) -> FloatArray:
         """Return the true feature in each period, (periods, m), with the desired one moved by an offset [m]."""
         rest, late = self._rest, self.latency if latency is None else latency
-        sensing = replace(without_disturbance(self._warm.plant.sensing), latency=round(late, TIME_DIGITS))
+        sensing = replace(
+            without_disturbance(self._warm.plant.sensing), latency=round(late, TIME_DIGITS)
+        )
         setup = PlantSetup(self._warm.model, rest.joint_position, self._period)
         plant = build_kinematic(replace(self._warm.plant, sensing=sensing), setup)
         count = round(DURATION / self._period)
-        desired = np.broadcast_to(rest.feature + offset, (count + 1 + rest.preview, len(rest.feature)))
+        desired = np.broadcast_to(
+            rest.feature + offset, (count + 1 + rest.preview, len(rest.feature))
+        )
         controller = _FrozenController(self._servo, self._state, rest, factor)
         rollout = Rollout(plant, plant.reset(0), desired, LoopSettings(count + 1, rest.preview))
         features = np.array([period.truth.feature for period in periods(rollout, controller)])
@@ -376,6 +416,8 @@ class _FrozenController(Controller):
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`."""
-        measured = self._rest.observation(observation.feature, observation.joint_position, observation.time)
+        measured = self._rest.observation(
+            observation.feature, observation.joint_position, observation.time
+        )
         self._state, u = self._servo.step(self._state, measured, reference)
         return Command(self._factor * u)

@@ -21,7 +21,15 @@ import pandas as pd
 from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
 from servobench.harness.analysis.comparison import number
-from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, at_rest, linearise, warm_up
+from servobench.harness.analysis.loops.equilibrium import (
+    PLANT,
+    TASK,
+    Rest,
+    Source,
+    at_rest,
+    linearise,
+    warm_up,
+)
 from servobench.harness.analysis.loops.systems import (
     POINTS,
     ArmModel,
@@ -54,6 +62,7 @@ SETTLING = 100  # [periods] of rest before the experiments
 MAX_MOTION = 0.1  # [m] beyond it a loop is not at small motions any more
 STEP_DURATION = 4.0  # [s] of the step responses
 FAST_POINTS = 150  # of the frequency axis where only the delay margin is wanted
+# Heading in a terminal -> column, factor, digits
 SHOWN: Final = {
     "gain\nmargin": ("gain_margin", 1.0, 2),
     "phase\nmargin, °": ("phase_margin_deg", 1.0, 0),
@@ -61,13 +70,14 @@ SHOWN: Final = {
     "peak\nM_s": ("sensitivity_peak", 1.0, 2),
     "disk\nmargin": ("disk_margin", 1.0, 2),
     "over-\nshoot, %": ("overshoot", 100.0, 0),
-}  # heading in a terminal -> column, factor, digits
+}
+# The same where limits were simulated, too
 SIMULATED: Final = {
     "gain\nmargin": ("gain_margin", 1.0, 2),
     "gain,\nsimulated": ("simulated_gain_margin", 1.0, 2),
     "latency\nlimit, ms": ("latency_limit_s", 1000.0, 0),
     "latency,\nsimulated": ("simulated_latency_limit_s", 1000.0, 0),
-}  # the same where limits were simulated, too
+}
 LEGEND = (
     "Gain margin: factor on the command. Delay margin: further latency of the camera. M_s: largest singular value of "
     "the sensitivity at the feature. Disk margin: for changes of each feature by itself. A dash: the loop is unstable. "
@@ -131,7 +141,9 @@ class LinearArm(Plant):
         if row < len(self._added):
             deviation = deviation + self._added[row]
             if not np.abs(deviation[:m]).max() < MAX_MOTION:
-                raise ControllerDiverged(f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions")
+                raise ControllerDiverged(
+                    f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions"
+                )
             self.measured.append(deviation)
         time = rest.time + self._k * self._period
         return Observation(time, rest.joint_position + deviation[m:], rest.feature + deviation[:m])
@@ -161,7 +173,9 @@ class SmallMotions:
         """
         wanted = self._rest.feature if desired is None else self._rest.feature + desired
         rows = np.tile(wanted, (len(added) + self._rest.preview + 1, 1))
-        rollout = Rollout(self._arm, self._arm.excite(added), rows, LoopSettings(len(added), self._rest.preview))
+        rollout = Rollout(
+            self._arm, self._arm.excite(added), rows, LoopSettings(len(added), self._rest.preview)
+        )
         command = [period.command.joint_velocity for period in periods(rollout, self._controller)]
         return Record(np.array(self._arm.measured), np.array(command))
 
@@ -246,7 +260,10 @@ class LoopAnalysis:
         """Return M_s with the command multiplied by each factor, at each latency [s], (factors, latencies)."""
         peaks = np.full((len(factors), len(latencies)), np.inf)
         every = max(1, len(self.response.frequency) // 128)
-        frequency, controller = self.response.frequency[::-every][::-1], self.response.controller[::-every][::-1]
+        frequency, controller = (
+            self.response.frequency[::-every][::-1],
+            self.response.controller[::-every][::-1],
+        )
         limits = self.gain_limits(latencies)
         for j, latency in enumerate(latencies):
             arm = replace(self.arm, latency=latency)
@@ -256,7 +273,9 @@ class LoopAnalysis:
         return peaks
 
 
-def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bool = False) -> LoopAnalysis:
+def analyse_loop(
+    resolved: ResolvedRun, source: Source = "true", *, identify: bool = False
+) -> LoopAnalysis:
     """Analyse the loop of a controller on the kinematic plant.
 
     Args:
@@ -274,12 +293,22 @@ def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bo
         steps = round(STEP_DURATION / arm.period)
         if isinstance(warm.controller, ServoController) and not identify:
             controller = linearise(*at_rest(warm, source))
-            closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
+            closed, response = (
+                closed_loop(arm.matrices(), controller),
+                linear_response(controller, arm),
+            )
             stable, step = is_stable(closed.A), closed.step(m, arm.period, steps)
             return LoopAnalysis(name, "linearised", stable, response.margins(), response, step)
         loop = SmallMotions(warm.controller, arm, warm.rest)
         response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)
-        return LoopAnalysis(name, "identified", True, response.margins(), response, step_responses(loop, m, n, steps))
+        return LoopAnalysis(
+            name,
+            "identified",
+            True,
+            response.margins(),
+            response,
+            step_responses(loop, m, n, steps),
+        )
 
 
 def delay_margin(
@@ -323,7 +352,12 @@ def delay_margin(
 
 
 def latency_border(
-    config: AnyConfig, name: str, latencies: Sequence[float], run: RunSettings, plant: KinematicConfig, robot: str
+    config: AnyConfig,
+    name: str,
+    latencies: Sequence[float],
+    run: RunSettings,
+    plant: KinematicConfig,
+    robot: str,
 ) -> float:
     """Return the latency of the camera [s] from which on a loop is predicted to be unstable; inf if none is.
 
@@ -350,7 +384,9 @@ def latency_border(
 def linear_response(controller: StateSpace, arm: ArmModel, points: int = POINTS) -> LoopResponse:
     """Return the frequency response of a linear controller on an arm, at so many points."""
     axis, measured = frequencies(arm.period, points), sum(arm.jacobian.shape)
-    return LoopResponse(axis, controller.response(np.exp(1j * axis * arm.period))[:, :, :measured], arm)
+    return LoopResponse(
+        axis, controller.response(np.exp(1j * axis * arm.period))[:, :, :measured], arm
+    )
 
 
 def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:

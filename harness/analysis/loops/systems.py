@@ -34,7 +34,9 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import discretise_lag
 
 ComplexArray = npt.NDArray[np.complex128]
-STABILITY_TOLERANCE = 1e-4  # [1] of a pole's modulus above 1, which neutral modes have by rounding of differences
+STABILITY_TOLERANCE = (
+    1e-4  # [1] of a pole's modulus above 1, which neutral modes have by rounding of differences
+)
 MIN_FREQUENCY = 1e-3  # [1] lowest frequency, as a share of the Nyquist frequency
 POINTS = 400  # of the frequency axis
 NEGLIGIBLE = 1e-6  # [1] a locus that stays below this never matters
@@ -52,14 +54,18 @@ class StateSpace(NamedTuple):
     def response(self, z: ComplexArray) -> ComplexArray:
         """Return C (zI − A)⁻¹ B + D, (k, outputs, inputs), at the points z, (k,), of the complex plane."""
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
-        return np.asarray(self.C @ np.linalg.solve(resolvent, self.B.astype(np.complex128)) + self.D)
+        return np.asarray(
+            self.C @ np.linalg.solve(resolvent, self.B.astype(np.complex128)) + self.D
+        )
 
     def step(self, outputs: int, period: float, periods: int) -> FloatArray:
         """Return each of the first outputs after a unit step of the input with its number, (periods, outputs)."""
         import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
 
         system, times = control.ss(*self, period), np.arange(periods) * period
-        steps = [control.step_response(system, times, input=i, output=i).outputs for i in range(outputs)]
+        steps = [
+            control.step_response(system, times, input=i, output=i).outputs for i in range(outputs)
+        ]
         return np.stack([np.ravel(step) for step in steps], axis=-1)
 
 
@@ -76,7 +82,12 @@ def closed_loop(plant: StateSpace, controller: StateSpace) -> StateSpace:
     measured = len(plant.C)
     B, D = controller.B, controller.D
     by_plant, by_law = D[:, :measured] @ plant.C, controller.C
-    A = np.block([[plant.A + plant.B @ by_plant, plant.B @ by_law], [B[:, :measured] @ plant.C, controller.A]])
+    A = np.block(
+        [
+            [plant.A + plant.B @ by_plant, plant.B @ by_law],
+            [B[:, :measured] @ plant.C, controller.A],
+        ]
+    )
     references = np.vstack([plant.B @ D[:, measured:], B[:, measured:]])
     C = np.hstack([plant.C, np.zeros((measured, len(controller.A)))])
     return StateSpace(A, references, C, np.zeros((measured, references.shape[1])))
@@ -101,9 +112,13 @@ class ArmModel:
     def matrices(self) -> StateSpace:
         """Return the system from u, (n,) rad/s, to deviations of measured feature and joint positions, (m + n,)."""
         joint, (m, n) = self._joint(), self.jacobian.shape
-        waiting = split(self.latency + self.age, self.period)[0] * m  # numbers of the frames under way
-        joints, B, positions = (np.kron(each, np.eye(n)) for each in (joint.A, joint.B, joint.C[1:]))
-        frames = block_diag(np.kron(joint.C[:1], self.jacobian), np.eye(waiting))  # exposed now, then under way
+        # Numbers of the frames under way
+        waiting = split(self.latency + self.age, self.period)[0] * m
+        joints, B, positions = (
+            np.kron(each, np.eye(n)) for each in (joint.A, joint.B, joint.C[1:])
+        )
+        # Exposed now, then under way
+        frames = block_diag(np.kron(joint.C[:1], self.jacobian), np.eye(waiting))
         A = np.vstack([np.pad(joints, ((0, 0), (0, waiting))), frames[:waiting]])
         C = np.vstack([frames[waiting:], np.pad(positions, ((0, 0), (0, waiting)))])
         return StateSpace(A, np.pad(B, ((0, waiting), (0, 0))), C, np.zeros((m + n, n)))
@@ -124,7 +139,11 @@ class ArmModel:
         _, early = split(self.latency + self.age, self.period)
         queue = waiting + (part > 0.0)
         every = np.eye(3 + queue + (early > 0.0))  # a row for each state, and the last one for u(k)
-        position, motion, commands = every[0], every[:2], np.vstack([every[-1], every[2 : 2 + queue]])
+        position, motion, commands = (
+            every[0],
+            every[:2],
+            np.vstack([every[-1], every[2 : 2 + queue]]),
+        )
 
         def after(time: float) -> FloatArray:
             """Return q and v `time` [s] into the period, of which the command of the period before has its part."""
@@ -141,7 +160,9 @@ class ArmModel:
             rows.append(after(self.period - early)[:1])
             exposed = every[-2]
         new = np.vstack(rows)
-        return StateSpace(new[:, :-1], new[:, -1:], np.vstack([exposed, position])[:, :-1], np.zeros((2, 1)))
+        return StateSpace(
+            new[:, :-1], new[:, -1:], np.vstack([exposed, position])[:, :-1], np.zeros((2, 1))
+        )
 
 
 def split(delay: float, period: float) -> tuple[int, float]:
@@ -158,7 +179,9 @@ class Margins:
     """The margins of a loop, by their columns in the table of loops."""
 
     gain_margin: float  # the factor on the command above 1 at which the loop becomes unstable; inf if there is none
-    gain_reduction_margin: float  # the factor below 1 at which it becomes unstable; 0 if there is none
+    gain_reduction_margin: (
+        float  # the factor below 1 at which it becomes unstable; 0 if there is none
+    )
     phase_margin_deg: float  # of all features together; inf where no locus crosses the unit circle
     delay_margin_s: float  # additional latency of the camera at which the loop becomes unstable; inf if there is none
     crossover_rad_s: float  # largest frequency at which a locus at the feature crosses the unit circle; 0 if none
@@ -211,7 +234,9 @@ class LoopResponse:
         return Margins(
             gain_margin=float(gain[gain >= 1.0].min(initial=np.inf)),
             gain_reduction_margin=float(gain[gain < 1.0].max(initial=0.0)),
-            phase_margin_deg=float(np.rad2deg(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf))),
+            phase_margin_deg=float(
+                np.rad2deg(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf))
+            ),
             delay_margin_s=float((phase / where).min(initial=np.inf)),
             crossover_rad_s=float(where.max(initial=0.0)),
             sensitivity_peak=float(largest_gain(S).max()),
@@ -271,7 +296,10 @@ def phase_crossings(L: ComplexArray, frequency: FloatArray) -> tuple[FloatArray,
     crosses = np.sign(level[:-1]) != np.sign(level[1:])
     share = level[:-1][crosses] / (level[:-1][crosses] - level[1:][crosses])
     row, _ = np.nonzero(crosses)
-    before, turn = np.angle(values[:-1][crosses]), np.angle(values[1:][crosses] / values[:-1][crosses])
+    before, turn = (
+        np.angle(values[:-1][crosses]),
+        np.angle(values[1:][crosses] / values[:-1][crosses]),
+    )
     phase = np.mod(before + share * turn + np.pi, 2.0 * np.pi)
     where = frequency[row] * (frequency[row + 1] / frequency[row]) ** share
     return phase, where

@@ -121,7 +121,10 @@ class Method:
         self._known = [self._default, nested_settings(tuned_point(entry))]
         space, first = find_space(name), first_points(name)
         seeds = range(plan.study_seed, plan.study_seed + plan.studies)
-        self.studies = [RunningStudy(study(name, space, first, plan.trials, plan.search, seed)) for seed in seeds]
+        self.studies = [
+            RunningStudy(study(name, space, first, plan.trials, plan.search, seed))
+            for seed in seeds
+        ]
 
     @property
     def done(self) -> int:
@@ -133,12 +136,20 @@ class Method:
         """Return the points that its studies ask for, after they went on as far as the ledger knows."""
         for each in self.studies:
             each.advance(self.ledger)
-        return [(self.ledger, self.name, each.wanted) for each in self.studies if each.wanted is not None]
+        return [
+            (self.ledger, self.name, each.wanted)
+            for each in self.studies
+            if each.wanted is not None
+        ]
 
     def wanted_on_second(self) -> list[Wanted]:
         """Return the points to score on the second set, once all studies have ended: their results and known values."""
         outcomes = [each.outcome for each in self.studies if each.outcome is not None]
-        points = [*self._scored(), *(each.settings for each in outcomes)] if len(outcomes) == len(self.studies) else []
+        points = (
+            [*self._scored(), *(each.settings for each in outcomes)]
+            if len(outcomes) == len(self.studies)
+            else []
+        )
         return [(self.second, self.name, point) for point in points]
 
     def _scored(self) -> list[Mapping[str, Any]]:
@@ -187,9 +198,15 @@ def check_study_folder(folder: Path) -> None:
     Raises:
         ConfigurationError: names the folder.
     """
-    names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name] * folder.exists()
+    names = (
+        [path.name for path in folder.iterdir()]
+        if folder.is_dir()
+        else [folder.name] * folder.exists()
+    )
     if set(names) - {LOCK} and not any(name.endswith(LEDGER) for name in names):
-        raise ConfigurationError(f"{folder} exists already and holds no study; name another folder with --out")
+        raise ConfigurationError(
+            f"{folder} exists already and holds no study; name another folder with --out"
+        )
 
 
 def open_methods(folder: Path, plan: TuningPlan) -> list[Method]:
@@ -253,8 +270,12 @@ class TunedValues:
     checked_score: float  # of these values on the subset `TuningSet.checked`
     checked_score_of_defaults: float
     settings: Mapping[str, Any]  # nested values
-    studies: tuple[StudyRecord, ...]  # empty for values that were found under another objective and only scored anew
-    edges: tuple[str, ...] = ()  # a line for each number at an edge of its box, which is wider in the next study
+    studies: tuple[
+        StudyRecord, ...
+    ]  # empty for values that were found under another objective and only scored anew
+    edges: tuple[
+        str, ...
+    ] = ()  # a line for each number at an edge of its box, which is wider in the next study
 
     @property
     def lost(self) -> bool:
@@ -266,7 +287,10 @@ def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
     """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
     values, boxes = flatten(nested), dict[str, Any](find_space(name))
     ends = ((key, end, boxes[key]) for key, end in edges(boxes, values).items())
-    return tuple(f"{key} = {values[key]:.4g} is at the {end} edge of {b.low:g} to {b.high:g}" for key, end, b in ends)
+    return tuple(
+        f"{key} = {values[key]:.4g} is at the {end} edge of {b.low:g} to {b.high:g}"
+        for key, end, b in ends
+    )
 
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:
@@ -281,8 +305,12 @@ def write_tuned(path: Path, tuned: TunedValues) -> None:
 def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
     """Return a table in TOML, those in it after its own values; `before` stands before their names."""
     nested = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    lines = "".join(f"{key} = {toml(value)}\n" for key, value in values.items() if key not in nested)
-    tables = (_table(value, f"{before}{key}.", f"\n[{before}{key}]\n") for key, value in nested.items())
+    lines = "".join(
+        f"{key} = {toml(value)}\n" for key, value in values.items() if key not in nested
+    )
+    tables = (
+        _table(value, f"{before}{key}.", f"\n[{before}{key}]\n") for key, value in nested.items()
+    )
     return heading * bool(lines or not nested) + lines + "".join(tables)
 
 
@@ -328,7 +356,9 @@ class Check:
             for key, other in neighbours(space, values):
                 both = [nested_settings(values), nested_settings(other)]
                 if both[0] != both[1]:
-                    self._changes.append((ledger, both, partial(Change, name, key, values[key], other[key])))
+                    self._changes.append(
+                        (ledger, both, partial(Change, name, key, values[key], other[key]))
+                    )
                     points |= {f"{name}{each}": (ledger, name, each) for each in both}
         self._points = list(points.values())
 
@@ -346,10 +376,19 @@ class Check:
 
     def changes(self) -> list[Change]:
         """Return every change whose scores are known."""
-        known = [(change, ledger.costs(both[0]), ledger.costs(both[1])) for ledger, both, change in self._changes]
-        return [change(score(before), score(after)) for change, before, after in known if before and after]
+        known = [
+            (change, ledger.costs(both[0]), ledger.costs(both[1]))
+            for ledger, both, change in self._changes
+        ]
+        return [
+            change(score(before), score(after))
+            for change, before, after in known
+            if before and after
+        ]
 
 
 def improvements(changes: Sequence[Change]) -> list[Change]:
     """Return the changes that gain more than the tolerance, the largest first."""
-    return sorted((change for change in changes if change.gain > TOLERANCE), key=lambda change: -change.gain)
+    return sorted(
+        (change for change in changes if change.gain > TOLERANCE), key=lambda change: -change.gain
+    )

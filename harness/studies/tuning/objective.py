@@ -52,11 +52,12 @@ from servobench.plant.contract.settings import Count, Periods, settings
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
 MOVE: Final = "random"
+# Settings of the tasks, short because a settled run needs no more time
 TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
     MOVE: {"duration": 6.0},
     "circle": {"radius": 0.17, "lap_time": 5.0},  # at 0.21 m/s, the whole task at 0.19 m/s
     "lemniscate": {"radius": 0.14, "lap_time": 5.0},
-}  # settings of the tasks, short because a settled run needs no more time
+}
 _LEAVING: Final[Varied] = (  # the networks' box by 0.5 rad each way
     ("task.lower", tuple(low - 0.5 for low in TRAINING_LOWER)),
     ("task.upper", tuple(high + 0.5 for high in TRAINING_UPPER)),
@@ -75,7 +76,16 @@ KINDS: Final[tuple[tuple[str, Varied], ...]] = (
 LEVELS: Final[Mapping[str, tuple[Any, ...]]] = {
     "latency": (0.0, 0.05, 0.1, 0.15),  # [s]
     "noise": (1.0, 4.0),  # factor
-    "detector": ("", "", "", "", "+outliers=5%", "+outliers=20%", "+jitter=100ms", "+lost_frames=50%"),
+    "detector": (
+        "",
+        "",
+        "",
+        "",
+        "+outliers=5%",
+        "+outliers=20%",
+        "+jitter=100ms",
+        "+lost_frames=50%",
+    ),
     "drive": ((), (), (), (), (), (), (("plant.command_delay", 0.0),), (("plant.overshoot", 0.3),)),
 }
 """One level of each is that of a world."""
@@ -91,13 +101,19 @@ MODELS: Final = (
 )
 """The mismatch of a robot."""
 WEIGHTS: Final[Mapping[str, float]] = {
-    task: len(KINDS) / 2 / sum((task == MOVE) == (other == MOVE) for other, _ in KINDS) for task, _ in KINDS
+    task: len(KINDS) / 2 / sum((task == MOVE) == (other == MOVE) for other, _ in KINDS)
+    for task, _ in KINDS
 }
-FLOOR: Final = 0.0015  # [m] error below which nothing is gained; that of `log_error` where the band is 5 mm
+FLOOR: Final = (
+    0.0015  # [m] error below which nothing is gained; that of `log_error` where the band is 5 mm
+)
 DECADES: Final = math.log10(1.0 / FLOOR)  # from the floor to 1 m
 WORST: Final = 1.0  # cost of a run that did not complete, and most of any run
-MIN_DELAY_MARGIN: Final = 0.05  # [s] of the loop at the usual latency; settings with less are refused without a run
-SECOND_OFFSET: Final = len(TUNING) // 2  # where in the tuning range the seeds of the second sets begin
+MIN_DELAY_MARGIN: Final = (
+    0.05  # [s] of the loop at the usual latency; settings with less are refused without a run
+)
+# Where in the tuning range the seeds of the second sets begin
+SECOND_OFFSET: Final = len(TUNING) // 2
 SECOND_FACTOR: Final = 3  # robots of the second set for each of the first
 
 
@@ -119,8 +135,12 @@ class TuningSet:
             raise ValueError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
             entry = find_plant(name)
-            if entry.own_robot or not isinstance(getattr(entry.config(), "sensing", None), SensingConfig):
-                raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
+            if entry.own_robot or not isinstance(
+                getattr(entry.config(), "sensing", None), SensingConfig
+            ):
+                raise ValueError(
+                    f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency"
+                )
 
     def second(self) -> Self:
         """Return the second, larger set: other robots of the tuning range, which no trial uses.
@@ -145,13 +165,25 @@ class TuningSet:
         level = {name: self._drawn(name, levels, len(KINDS)) for name, levels in LEVELS.items()}
         runs = []
         for plant in self.plants:
-            known = flatten(find_plant(plant).config())  # rendered drives have no setting for their overshoot
-            drives = [[pair for pair in drive if pair[0].partition(".")[2] in known] for drive in level["drive"]]
+            # Rendered drives have no setting for their overshoot
+            known = flatten(find_plant(plant).config())
+            drives = [
+                [pair for pair in drive if pair[0].partition(".")[2] in known]
+                for drive in level["drive"]
+            ]
             for run, (seed, model) in enumerate(zip(seeds, models, strict=True)):
                 world = run // self.robots
                 task, varied = KINDS[world]
-                own = *varied, *drives[world], *((key, level[key][world]) for key in ("noise", "latency"))
-                runs.append(RunRequest(plant, "", task, read_mismatch(model + level["detector"][world]), seed, own))
+                own = (
+                    *varied,
+                    *drives[world],
+                    *((key, level[key][world]) for key in ("noise", "latency")),
+                )
+                runs.append(
+                    RunRequest(
+                        plant, "", task, read_mismatch(model + level["detector"][world]), seed, own
+                    )
+                )
         return runs
 
     def _drawn(self, name: str, levels: Sequence[Any], count: int) -> list[Any]:
@@ -162,7 +194,13 @@ class TuningSet:
     def checked(self) -> list[int]:
         """Return the indices of a subset small enough for a test: two robots on moves, two on a circle."""
         curve = next(world for world, (task, _) in enumerate(KINDS) if task != MOVE)
-        return sorted({world * self.robots + robot for world in (0, curve) for robot in range(min(2, self.robots))})
+        return sorted(
+            {
+                world * self.robots + robot
+                for world in (0, curve)
+                for robot in range(min(2, self.robots))
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -176,7 +214,9 @@ class Trial:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
         given = Settings(TASKS)
-        sections = Sections(resolve_sections(requests, given) | {self.controller: self.config}, given, {})
+        sections = Sections(
+            resolve_sections(requests, given) | {self.controller: self.config}, given, {}
+        )
         return [select(request, sections) for request in requests]
 
     def build(self, runs: Sequence[RunRequest]) -> None:
@@ -193,7 +233,11 @@ def run_cost(task: str, row: Mapping[str, Any]) -> float:
     weight = WEIGHTS[task]
     if row["status"] != COMPLETED:
         return weight * WORST
-    decades = float(row["log_error"]) if task == MOVE else math.log10(max(row["rms_error_evaluated"] / FLOOR, 1.0))
+    decades = (
+        float(row["log_error"])
+        if task == MOVE
+        else math.log10(max(row["rms_error_evaluated"] / FLOOR, 1.0))
+    )
     return weight * min(decades / DECADES, WORST)
 
 
@@ -202,7 +246,9 @@ def score(costs: Sequence[float]) -> float:
     return float(np.mean(costs))
 
 
-def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[tuple[int, int, float]]:
+def evaluate(
+    trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers
+) -> Iterator[tuple[int, int, float]]:
     """Carry out every run of every trial; yield indices of trial and run with each cost as it is known, in any order.
 
     Args:
@@ -218,9 +264,13 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Worke
         for r, run in enumerate(trial.resolved(runs)):
             kinds.setdefault(side_by_side_key(run), []).append((t, r, run))
     order = [(kind, *each) for kind, same in kinds.items() for each in same]
-    jobs = [Job(index, Cell(run.request), run, kind) for index, (kind, _, _, run) in enumerate(order)]
+    jobs = [
+        Job(index, Cell(run.request), run, kind) for index, (kind, _, _, run) in enumerate(order)
+    ]
     own = offered(dict.fromkeys(run.plant for run in runs))
-    for block, outcome in carry_out_blocks(cut(jobs, even_size(len(jobs), workers.count), 1, own), workers):
+    for block, outcome in carry_out_blocks(
+        cut(jobs, even_size(len(jobs), workers.count), 1, own), workers
+    ):
         for job, result in zip(block.jobs, outcome, strict=True):
             _, t, r, _ = order[job.index]
             yield t, r, run_cost(runs[r].task, result.row)
@@ -257,11 +307,17 @@ class Ledger:
         with configuration_errors(f"study {self.path} cannot be opened: ", *wrong):
             content = self.path.read_bytes()
             self._size = content.rfind(b"\n") + 1
-            header, *records = [json.loads(line) for line in content[: self._size].splitlines()] or [self._fingerprint]
+            header, *records = [
+                json.loads(line) for line in content[: self._size].splitlines()
+            ] or [self._fingerprint]
             self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
         known = header if isinstance(header, dict) else {}
-        if parts := ", ".join(key for key, value in self._fingerprint.items() if known.get(key) != value):
-            raise ConfigurationError(f"study {self.path} was made with other {parts}; name another folder with --out")
+        if parts := ", ".join(
+            key for key, value in self._fingerprint.items() if known.get(key) != value
+        ):
+            raise ConfigurationError(
+                f"study {self.path} was made with other {parts}; name another folder with --out"
+            )
 
     def best(self) -> float | None:
         """Return the least mean cost, or None while there is none."""
@@ -273,7 +329,9 @@ class Ledger:
 
     def add(self, settings: Mapping[str, Any], costs: Sequence[float]) -> None:
         """Write the costs of the runs under nested settings down."""
-        lines = [self._fingerprint] * (not self._size) + [{"settings": settings, "costs": list(costs)}]
+        lines = [self._fingerprint] * (not self._size) + [
+            {"settings": settings, "costs": list(costs)}
+        ]
         with accessing(self.path, "study"), self.path.open("ab") as file:
             file.truncate(self._size)
             file.write("".join(f"{json.dumps(line)}\n" for line in lines).encode())
@@ -285,7 +343,11 @@ class Ledger:
 
 def _costs(given: object) -> list[float]:
     """Return the costs of a record; a ValueError if they are no numbers."""
-    if not isinstance(given, list) or not given or not all(type(each) in (int, float) for each in given):
+    if (
+        not isinstance(given, list)
+        or not given
+        or not all(type(each) in (int, float) for each in given)
+    ):
         raise ValueError(f"costs must be a list of numbers, got {str(given)[:SHOWN]}")
     return [float(each) for each in given]
 
@@ -307,7 +369,9 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
     plants = Survey(plants=dict.fromkeys(runs.plants))
     files = named_files(plants, {}, offered(runs.plants))
     fingerprint = {
-        "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
+        "defaults": {
+            key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()
+        },
         "objective": {name: repr(value) for name, value in constants.items()},
         "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
         "plants": [*runs.plants, *files.values(), *(each["sha256"] for _, each in plugins(plants))],
@@ -339,7 +403,9 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
             lacking[f"{name}{nested}"] = ledger, trial, nested
     points = list(lacking.values())
     costs = np.full((len(points), len(requests)), np.nan)
-    for point_index, run_index, cost in evaluate([trial for _, trial, _ in points], requests, workers):
+    for point_index, run_index, cost in evaluate(
+        [trial for _, trial, _ in points], requests, workers
+    ):
         costs[point_index, run_index] = cost
         if not np.isnan(costs[point_index]).any():
             ledger, trial, nested = points[point_index]

@@ -64,8 +64,15 @@ LIMITS: Final[Mapping[str, float]] = {
 _log: Final = partial(FloatDistribution, log=True)
 _SWITCH: Final = CategoricalDistribution((False, True))
 _AIDS: Final[Space] = {
-    **{f"aids.{name}": CategoricalDistribution(aid.tuned) for name, aid in SWITCHES.items() if aid.tuned},  # type: ignore[arg-type]
-    **{f"aids.{name}": FloatDistribution(each.low, each.high, log=each.log) for name, each in RANGES.items()},
+    **{
+        f"aids.{name}": CategoricalDistribution(aid.tuned)  # type: ignore[arg-type]
+        for name, aid in SWITCHES.items()
+        if aid.tuned
+    },
+    **{
+        f"aids.{name}": FloatDistribution(each.low, each.high, log=each.log)
+        for name, each in RANGES.items()
+    },
 }
 _P: Final[Space] = {
     "law.proportional_gain": _log(0.5, 30.0),  # 1/s
@@ -86,7 +93,9 @@ _RBFNN: Final[Space] = {
     "law.k": _log(0.01, 1.0),
     "law.epsilon": _log(1e-5, 1e-1),  # m⁴
     "law.horizon": IntDistribution(3, 10),  # steps of 0.05 s, at most the preview
-    "training.controller.gain": FloatDistribution(2.0, 5.0, step=1.0),  # 1/s; each value is a training of its own
+    "training.controller.gain": FloatDistribution(
+        2.0, 5.0, step=1.0
+    ),  # 1/s; each value is a training of its own
 }
 _RBF: Final[Space] = {
     "estimator.k2": _log(0.05, 1.8),
@@ -113,8 +122,13 @@ _CFDL: Final[Space] = {
     "estimator.step_factor": FloatDistribution(0.05, 1.9),
     "estimator.regularisation": _log(1e-5, 0.1),  # rad²
 }
-_MPC_AIDS: Final = {key: each for key, each in _AIDS.items() if key not in ("aids.feedforward", "aids.limit")}
-_MPC_SWITCHES: Final[Space] = {"law.mode": CategoricalDistribution(("constant", "moves")), "law.use_preview": _SWITCH}
+_MPC_AIDS: Final = {
+    key: each for key, each in _AIDS.items() if key not in ("aids.feedforward", "aids.limit")
+}
+_MPC_SWITCHES: Final[Space] = {
+    "law.mode": CategoricalDistribution(("constant", "moves")),
+    "law.use_preview": _SWITCH,
+}
 _START: Final[Space] = {"initial.source": CategoricalDistribution(("nominal", "probe"))}
 _RBFNN_SWITCHES: Final[Space] = {
     "law.offset_free": _SWITCH,
@@ -168,7 +182,9 @@ def find_space(name: str) -> Space:
 
 def _switches(space: Space) -> Space:
     """Return the parameters of a space that are a choice, not a number."""
-    return {key: choice for key, choice in space.items() if isinstance(choice, CategoricalDistribution)}
+    return {
+        key: choice for key, choice in space.items() if isinstance(choice, CategoricalDistribution)
+    }
 
 
 def edges(space: Space, values: Point) -> dict[str, str]:
@@ -219,7 +235,10 @@ def values_of(name: str, config: Any) -> Point:  # noqa: ANN401 - any configurat
 
 def nested_settings(values: Point) -> dict[str, Any]:
     """Return the nested settings of a point of a search space, numbers rounded to three digits."""
-    rounded = {key: float(f"{each:.{DIGITS}g}") if isinstance(each, float) else each for key, each in values.items()}
+    rounded = {
+        key: float(f"{each:.{DIGITS}g}") if isinstance(each, float) else each
+        for key, each in values.items()
+    }
     return nest(rounded)
 
 
@@ -246,7 +265,9 @@ class StudyRecord:
     best_trial: int  # the number of the best one; 0 is that of the defaults
     best_trial_score: float
     search_points: int  # scored by the coordinate search that began there
-    search_complete: bool  # whether no change of one value improves the score; False: its budget ended first
+    search_complete: (
+        bool  # whether no change of one value improves the score; False: its budget ended first
+    )
     score: float  # at its end
     second_score: float  # of the same settings on the second set; NaN until they are scored there
     settings: Mapping[str, Any]  # nested values
@@ -272,7 +293,9 @@ def study(
         if number < len(first):
             sampled.enqueue_trial(dict(first[number]))
         with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
-            sampled.sampler = TPESampler(seed=named_seed(seed, f"{name}, trial {number}"), multivariate=True)
+            sampled.sampler = TPESampler(
+                seed=named_seed(seed, f"{name}, trial {number}"), multivariate=True
+            )
         with np.errstate(all="ignore"):  # the sampler's densities may underflow
             trial = sampled.ask(dict(space))
         score = yield trial.params
@@ -280,11 +303,19 @@ def study(
         sampled.tell(trial, score)
     best = min(range(trials), key=lambda number: tried[number][0])
     found = yield from coordinate_search(space, tried[best][1], tried[best][0], search)
-    search_end = (found.evaluations, found.complete, found.score, math.nan, nested_settings(found.values))
+    search_end = (
+        found.evaluations,
+        found.complete,
+        found.score,
+        math.nan,
+        nested_settings(found.values),
+    )
     return StudyRecord(seed, trials, best, tried[best][0], *search_end)
 
 
-def coordinate_search(space: Space, values: Point, score: float, budget: int) -> Generator[Point, float, Found]:
+def coordinate_search(
+    space: Space, values: Point, score: float, budget: int
+) -> Generator[Point, float, Found]:
     """Improve a point: a generator that yields the points whose scores it needs, and returns the last one kept.
 
     Args:
@@ -333,7 +364,9 @@ def _step(distribution: FloatDistribution | IntDistribution, value: float, sign:
 
 def neighbours(space: Space, values: Point) -> list[tuple[str, Point]]:
     """Return every point that differs from `values` by one change, with the key that is changed."""
-    return [(key, {**values, key: other}) for key in space for other in changes(space[key], values[key])]
+    return [
+        (key, {**values, key: other}) for key in space for other in changes(space[key], values[key])
+    ]
 
 
 def first_points(name: str) -> list[Point]:
@@ -347,7 +380,9 @@ def first_points(name: str) -> list[Point]:
     flips = [point for _, point in neighbours(_switches(space), default)]
     points = [default, own, *flips]
     for other in SPACES:
-        shared = {key: value for key, value in flatten(tuned_settings(other)).items() if key in space}
+        shared = {
+            key: value for key, value in flatten(tuned_settings(other)).items() if key in space
+        }
         if shared and other != name:
             points.append(inside(space, {**own, **shared}, own))
     return list({str(nested_settings(point)): point for point in points}.values())
@@ -374,4 +409,7 @@ def _within(distribution: Distribution, value: Any, otherwise: Any) -> Any:  # n
     within = min(max(value, distribution.low), distribution.high)
     if distribution.step is None:
         return within
-    return type(within)(distribution.low + distribution.step * round((within - distribution.low) / distribution.step))
+    return type(within)(
+        distribution.low
+        + distribution.step * round((within - distribution.low) / distribution.step)
+    )
