@@ -81,10 +81,12 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.fixture(scope="session", autouse=True)
 def _interrupts_arrive():
-    """Handle SIGINT, which `nohup`, a shell's `&` and some programs leave ignored for all processes below them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Handle SIGINT and SIGHUP, which `nohup` and a shell's `&` leave ignored for all processes below them."""
+    interrupt = signal.signal(signal.SIGINT, signal.default_int_handler)
+    hang_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGHUP, hang_up)
 
 
 @pytest.fixture(autouse=True)
