@@ -10,6 +10,7 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- metrics: table -->
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
+    <!-- table: challenges:severe,wide -->
     <!-- stored: dynamics,dynamics_circle -->
     <!-- studies: docs/page_studies -->
     <!-- methods: table -->
@@ -23,8 +24,8 @@ A generated part of a page is everything between two comments, of which the firs
 The meaning of a setting is the string below its field, the default that of the class, with the other choices behind it.
 Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
-in which they differ. A measured table is one of docs/tables, which `make results` writes; until it exists the part
-stays as it is. `stored` links to measured tables of a study instead. `attributes` and `interface` print docstrings
+in which they differ. A measured table is one of docs/tables, or some of its rows by their first cell. `make results`
+writes it; until it exists the part stays as it is. `stored` links to measured tables of a study instead. `attributes` and `interface` print docstrings
 and signatures. `install` shows how to install servobench with extras: once a release is on a package index, set
 `RELEASED` and call `make tables`.
 """
@@ -231,15 +232,20 @@ def measured(part: re.Match[str], folder: Path) -> str:
         part: of the page, which names the tables.
         folder: of the page, from which its links go.
     """
-    paths = [stored_tables.FOLDER / f"{name}.csv" for name in part[3].split(",")]
+    named, _, chosen = part[3].partition(":")
+    paths = [stored_tables.FOLDER / f"{name}.csv" for name in named.split(",")]
     if not all(path.exists() for path in paths):
         return part[4].strip("\n")
     stamp, rows = stored_tables.read(paths[0])
     origin = f"commit {stamp['commit'][:12]}, version {stamp['version']}"
     links = {path.stem: Path(os.path.relpath(path, folder)).as_posix() for path in paths}
     if part[2] == "stored":
-        return f"All rows: {', '.join(f'[`{name}`]({link})' for name, link in links.items())} ({origin})"
-    return f"{table(tuple(rows), rows.itertuples(index=False))}\n\n{origin}; [commands]({links[part[3]]})"
+        listed = ", ".join(f"[`{name}`]({link})" for name, link in links.items())
+        return f"All rows: {listed} ({origin})"
+    if chosen:
+        wanted = [f"`{row}`" for row in chosen.split(",")]
+        rows = rows.set_index(rows.columns[0], drop=False).loc[wanted]
+    return f"{table(tuple(rows), rows.itertuples(index=False))}\n\n{origin}; [commands]({links[named]})"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
