@@ -20,10 +20,11 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
 
 LOG_RATIOS: Final = np.log(2.0) * np.arange(-2, 8)  # [1] ln of σ_j relative to the guess
-LOG_DEVIATION: Final = 1.5  # [1] of ln σ at first
-FORGETTING: Final = 0.99  # [1] f, of the scores per sample
-OUTLIER: Final = 0.1  # [unit of the feature]
+LOG_DEVIATION: Final = 1.5  # [1] prior deviation of ln σ
+FORGETTING: Final = 0.99  # [1] f, what is left of the scores after a sample
+OUTLIER: Final = 0.1  # [unit of the feature] deviation of outliers
 OUTLIER_ODDS: Final = 4.6  # [1] −2 ln of the share of outliers, a tenth
+MIN_LOG_LIKELIHOOD: Final = -600.0  # [1] exp of less than −700 underflows
 
 
 class NoiseLevel(NamedTuple):
@@ -36,8 +37,10 @@ class NoiseLevel(NamedTuple):
     @classmethod
     def start(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:
         """Return the state of a first guess of σ, m, with leading axes of the shape `lead`."""
-        variance, scores = np.full(lead, deviation**2)[()], np.square(LOG_RATIOS / LOG_DEVIATION)
-        return cls(variance, np.broadcast_to(scores, (*lead, len(scores))), variance)
+        variance = np.full(lead, deviation**2)[()]
+        prior = np.square(LOG_RATIOS / LOG_DEVIATION)
+        scores = np.broadcast_to(prior, (*lead, len(prior)))
+        return cls(variance, scores, guess=variance)
 
     @property
     def deviation(self) -> FloatArray:
@@ -66,11 +69,15 @@ def _learned(
     multiple: FloatArray,
     other: FloatArray,
 ) -> NoiseLevel:
-    own = (multiple * level.guess)[..., None] * np.exp(2.0 * LOG_RATIOS)
-    s, K = own + np.maximum(other, 0.0)[..., None], count[..., None]
-    new = np.minimum(square[..., None] / s + K * np.log(s), K * np.log(OUTLIER**2) + OUTLIER_ODDS)
-    scores = FORGETTING * level.scores + new
+    """Return the level after an innovation that is not 0; as in `NoiseLevel.learn`."""
+    a = (multiple * level.guess)[..., None]
+    b = np.maximum(other, 0.0)[..., None]
+    K = count[..., None]
+    s = a * np.exp(2.0 * LOG_RATIOS) + b
+    inlier = square[..., None] / s + K * np.log(s)
+    outlier = K * np.log(OUTLIER**2) + OUTLIER_ODDS
+    scores = FORGETTING * level.scores + np.minimum(inlier, outlier)
     scores = scores - np.minimum.reduce(scores, axis=-1)[..., None]
-    likelihood = np.exp(np.maximum(-0.5 * scores, -600.0))  # exp of less than −700 underflows
-    mean = np.vecdot(likelihood, LOG_RATIOS) / np.add.reduce(likelihood, axis=-1)
-    return level._replace(variance=level.guess * np.exp(2.0 * mean), scores=scores)
+    likelihood = np.exp(np.maximum(-0.5 * scores, MIN_LOG_LIKELIHOOD))
+    log_ratio = np.vecdot(likelihood, LOG_RATIOS) / np.add.reduce(likelihood, axis=-1)
+    return level._replace(variance=level.guess * np.exp(2.0 * log_ratio), scores=scores)

@@ -11,24 +11,26 @@ the filter that predicts best has the delay:
 A false frame shows once a later one is seen, by ν of the motion since the last frame that was believed, the anchor:
 
     ν_d = Δy + e − M x_d − E Δq_d                the frame is doubtful if ‖ν_d‖² > g σ² for every delay d of its end,
-    ‖ν‖² < ½ min_d ‖ν_d‖² of the one before      and false then: learned is from the anchor as if it had been lost
+    ‖ν‖² < ½ min_d ‖ν_d‖² of the one before      and then that one was false: what is learned now is the whole motion
+                                                 since the anchor, as if the false frame had been lost
 
 σ keeps the innovations of false frames, as it would stay too small without all large ones.
-E belongs to it: where the model is wrong by more than a map, filters without E take the error for noise, and find the
-delay at which it happens to be smallest. The first sample of the noise σ is a guess (`noise_level`). A regression over
-the motions that the delay pairs then gives the Jacobian.
+The error E is necessary: where the model is wrong by more than a map, filters without E take the error for noise, and
+find the delay at which it happens to be smallest. The first sample of the noise σ is a guess (`noise_level`). A
+regression over the motions that the delay pairs then gives the Jacobian.
 """
 
 import math
 import operator
 from collections.abc import Iterable
 from functools import reduce
-from typing import Final, NamedTuple, Self, TypeAlias, cast, final
+from typing import Final, NamedTuple, Self, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.choice import choose
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import in_periods, whole_periods
@@ -47,25 +49,24 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
-MAX_GAP = (
-    16  # longest motion over lost frames from which is learned, in motions of the least length
-)
-MIN_CHANGE_RATIO = (
-    0.8  # [1] of a motion's change between candidates to noise, above which delays differ
-)
-MAX_BIAS_RATIO = 0.25  # [1] of the model's error to noise, above which a steady motion would favour a wrong delay
+# A motion over lost frames teaches nothing if it is longer than this many motions of the least length.
+MAX_GAP: Final = 16
+# Candidate delays differ only by noise if the motion changes between neighbours by less than this share of the noise.
+MIN_CHANGE_RATIO: Final = 0.8  # [1]
+# A model error below this share of the noise cannot favour a wrong delay, so that a steady motion counts as well.
+MAX_BIAS_RATIO: Final = 0.25  # [1]
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
-DOUBT: Final = 100.0  # [1] g
-RETURN: Final = 0.5  # [1] of ‖ν‖² at a later frame to that of a doubtful one
-DOUBTFUL = 4  # longest motion with doubtful frames, in motions of the least length
-MAP_WALK: Final = 0.1  # [1/√m] w, of an entry of M
-REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
-REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
-MODEL_ERROR: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
-MAP_DEVIATION: Final = (
-    0.55  # [1] of an entry of M at first; larger ones favour late delays while an arm speeds up
-)
-FeatureMotion: TypeAlias = tuple[FloatArray, FloatArray, BoolArray]  # the first three of `Paired`
+DOUBT_GATE: Final = 100.0  # [1] g
+# A doubtful frame was false if ‖ν‖² of the motion past it is below this share of the ‖ν‖² of the motion to it.
+TAKE_BACK_RATIO: Final = 0.5  # [1]
+# A motion since the anchor is doubtful no longer if it is longer than this many motions of the least length.
+MAX_DOUBTFUL_GAP: Final = 4
+MAP_WALK: Final = 0.1  # [1/√m] w, random walk of an entry of M
+REST_DEVIATION: Final = 0.2  # [m/rad] prior deviation of an entry of E
+REST_WALK: Final = 0.1  # [m/rad/√rad] u, random walk of an entry of E
+UNEXPLAINED_SHARE: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
+# The prior deviation of an entry of M. Larger ones favour late delays while an arm speeds up.
+MAP_DEVIATION: Final = 0.55  # [1]
 
 
 @final
@@ -85,18 +86,12 @@ class Candidates:
 
     def __init__(self, delays: FloatArray) -> None:
         """Take the delays, (D,), periods, in order."""
+        count = len(delays)
         self.delays = delays
-        self.beside = np.abs(np.arange(len(delays)) - 1) % len(delays)
+        self.beside = np.abs(np.arange(count) - 1) % count
         self._whole = delays.astype(np.int_)
         self.longest = int(self._whole[-1])
-        c = delays - self._whole
-        bend = -0.5 * c * (1.0 - c)
-        weights = (
-            np.stack([1.0 - c + bend, c - 2.0 * bend, bend])
-            if c.any()
-            else np.ones((1, len(delays)))
-        )
-        self._weights = weights[..., None]
+        self._weights = interpolation_weights(delays - self._whole)[..., None]
 
     @classmethod
     def up_to(cls, longest: float, period: float) -> Self:
@@ -104,31 +99,38 @@ class Candidates:
 
         They lie about `RESOLUTION` apart: a whole number of periods, or a period divided by a whole number.
         """
-        spacing = max(1, whole_periods(RESOLUTION, period)) / max(
-            1, whole_periods(period, RESOLUTION)
-        )
+        periods_each = max(1, whole_periods(RESOLUTION, period))
+        delays_a_period = max(1, whole_periods(period, RESOLUTION))
+        spacing = periods_each / delays_a_period
         count = 1 + math.floor(whole_periods(longest, period) / spacing)
         return cls(np.asarray(spacing * np.arange(count), dtype=np.float64))
 
     def ends(self, past: FloatArray) -> FloatArray:
         """Return the past (..., H, columns) at each delay, (..., D, columns)."""
-        return weighted(
-            self._weights, [past[..., self._whole + i, :] for i in range(len(self._weights))]
-        )
+        rows = [past[..., self._whole + i, :] for i in range(len(self._weights))]
+        return weighted(self._weights, rows)
 
     def begins(self, past: FloatArray, periods: FloatArray) -> FloatArray:
         """Return the past (..., H, columns) at each delay and about `periods` (...) before, (..., D, columns)."""
         first = self._whole + np.rint(periods).astype(np.int_)[..., None]
-        return weighted(
-            self._weights, [pick(past, first + i, axes=1) for i in range(len(self._weights))]
-        )
+        rows = [pick(past, first + i, axes=1) for i in range(len(self._weights))]
+        return weighted(self._weights, rows)
 
     def exposed(self, past: FloatArray, candidate: IntArray) -> FloatArray:
         """Return the past (..., H, columns) at a candidate delay (...) and a period before, (..., 2, columns)."""
         count = len(self._weights)
-        rows = pick(past, np.take(self._whole, candidate)[..., None] + np.arange(count + 1), axes=1)
+        first = np.take(self._whole, candidate)[..., None]
+        rows = pick(past, first + np.arange(count + 1), axes=1)
         weights = [np.take(each, candidate, axis=0)[..., None] for each in self._weights]
         return weighted(weights, [rows[..., i : i + 2, :] for i in range(count)])
+
+
+def interpolation_weights(c: FloatArray) -> FloatArray:
+    """Return the weights of x_w, x_{w+1} and x_{w+2}, (3, D), at shares c (D,) of a period; (1, D) if all c are 0."""
+    if not c.any():
+        return np.ones((1, len(c)))
+    bend = -0.5 * c * (1.0 - c)
+    return np.stack([1.0 - c + bend, c - 2.0 * bend, bend])
 
 
 def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> FloatArray:
@@ -136,8 +138,8 @@ def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> Float
     return reduce(operator.add, map(operator.mul, weights, rows))
 
 
-class Known(NamedTuple):
-    """What returns with an anchor; as in `PairState`."""
+class Identified(NamedTuple):
+    """The part of a `PairState` that returns when a false frame is taken back; the fields are the same."""
 
     bank: FloatArray
     scores: FloatArray
@@ -148,11 +150,17 @@ class Known(NamedTuple):
 class Anchor(NamedTuple):
     """The last frame that was believed, and the motion since then if the frames of it are doubtful."""
 
-    known: Known  # at the anchor
+    known: Identified  # at the anchor
     step: FloatArray  # Δy, (..., m)
     duration: FloatArray  # (...), s
     valid: BoolArray  # (..., m), features that were measured at both ends
     miss: FloatArray  # min_d ‖ν_d‖², (...), of the last frame; 0 where it is the anchor
+
+    @classmethod
+    def at_last_frame(cls, known: Identified, features: int) -> Self:
+        """Return the anchor at a frame that is believed, since which no motion ended; `features` is m."""
+        none = np.zeros((*np.shape(known.candidate), features))
+        return cls(known, step=none, duration=none[..., 0], valid=none == 0.0, miss=none[..., 0])
 
 
 class PairState(NamedTuple):
@@ -170,9 +178,16 @@ class PairState(NamedTuple):
 
     def anchored(self) -> Self:
         """Return the state with its last frame as the anchor."""
-        known = Known(*(getattr(self, name) for name in Known._fields))
-        none = np.zeros((*np.shape(self.candidate), self.base.shape[-2]))
-        return self._replace(anchor=Anchor(known, none, none[..., 0], none == 0.0, none[..., 0]))
+        known = Identified(self.bank, self.scores, self.candidate, self.regression)
+        return self._replace(anchor=Anchor.at_last_frame(known, self.base.shape[-2]))
+
+
+class FeatureMotion(NamedTuple):
+    """A motion of the feature between two frames; as in `Paired`."""
+
+    feature_step: FloatArray
+    duration: FloatArray
+    valid: BoolArray
 
 
 class Paired(NamedTuple):
@@ -196,9 +211,8 @@ class Past(NamedTuple):
     before: FloatArray  # q(k−d) − q(k−d−1), (..., n), rad.
     # J_n Δq, (..., m), along each of them: from q(k−d−1) to q(k−d), and from there to q(k).
     predicted: tuple[FloatArray, FloatArray]
-    window: (
-        FloatArray  # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
-    )
+    # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
+    window: FloatArray
     noise: FloatArray  # e, (..., m), of the last frame from which was learned.
 
 
@@ -215,46 +229,61 @@ class Pairing:
     def __init__(self, aids: AidsConfig, knowledge: RobotKnowledge, latency: float) -> None:
         """Take settings, sizes and period, and the latency [s] of a given delay."""
         spec = knowledge.spec
-        self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
-        motion = max(1, whole_periods(MOTION_TIME, spec.period))
+        self._aids = aids
+        self._n = spec.n
+        self._m = spec.m
+        self._period = spec.period
         if aids.delay == "identified":
             self._candidates = Candidates.up_to(aids.longest_delay, spec.period)
         else:
             given = in_periods(latency, spec.period) if aids.delay == "given" else 0.0
             self._candidates = Candidates(np.array([given]))
         self.delays = self._candidates.delays
+        motion = max(1, whole_periods(MOTION_TIME, spec.period))
+        doubtful = MAX_DOUBTFUL_GAP * motion
         self.gap = MAX_GAP * motion
-        self._doubtful = (DOUBTFUL * motion + 0.5) * spec.period
-        self._rows = self._candidates.longest + self.gap + DOUBTFUL * motion + 4
+        self._longest_doubtful = (doubtful + 0.5) * spec.period
+        # The rows reach back to the begin of the longest motion since an anchor at the longest delay. Four more are for
+        # this period, for the two rows beyond that interpolation needs, and for rounding.
+        self._rows = self._candidates.longest + self.gap + doubtful + 4
         self.regression = Regression(knowledge)
         self._variances = np.repeat([MAP_DEVIATION**2, REST_DEVIATION**2], [self._m, self._n])
 
     def start(self, observation: Observation, base: FloatArray) -> PairState:
         """Return the state of an arm that has rested, with J_n (..., m, n) there."""
-        q, lead, m = observation.joint_position, observation.feature.shape[:-1], self._m
-        none, frame = np.zeros(lead, dtype=np.int_)[()], self._aids.feature_noise**2
+        q = observation.joint_position
+        lead = observation.feature.shape[:-1]
+        m = self._m
+        frame = self._aids.feature_noise**2
         row = np.concatenate([q, np.zeros((*lead, m))], axis=-1)
         bank = fresh_bank(np.eye(m, m + self._n), self._variances, frame)
-        known = Known(
-            bank=np.broadcast_to(bank, (*lead, len(self.delays), *bank.shape)),
-            scores=np.zeros((*lead, len(self.delays))),
-            candidate=none,
+        count = len(self.delays)
+        known = Identified(
+            bank=np.broadcast_to(bank, (*lead, count, *bank.shape)),
+            scores=np.zeros((*lead, count)),
+            candidate=np.zeros(lead, dtype=np.int_)[()],
             regression=self.regression.start(lead, frame),
         )
-        past, unset = np.repeat(row[..., None, :], self._rows, axis=-2), cast("Anchor", None)
-        noise = NoiseLevel.start(self._aids.feature_noise, lead)
         return PairState(
-            past, base, noise=noise, nis=np.zeros(lead)[()], anchor=unset, **known._asdict()
-        ).anchored()
+            past=np.repeat(row[..., None, :], self._rows, axis=-2),
+            base=base,
+            noise=NoiseLevel.start(self._aids.feature_noise, lead),
+            nis=np.zeros(lead)[()],
+            anchor=Anchor.at_last_frame(known, m),
+            **known._asdict(),
+        )
 
     def advance(self, state: PairState, joint_position: FloatArray, base: FloatArray) -> PairState:
         """Return the state one period later, with the arm at `joint_position` (..., n), rad, and J_n there."""
-        past, n = state.past, self._n
+        n = self._n
+        past = state.past
+        dq = joint_position - past[..., 0, :n]
+        # With the mean of J_n at both ends the error of J_n Δq is of third order in the motion.
+        mean = 0.5 * (state.base + base)
         new = np.empty_like(past)
         new[..., 1:, :] = past[..., :-1, :]
         new[..., 0, :n] = joint_position
-        mean = 0.5 * (state.base + base)  # of both ends: the error is of third order in the motion
-        new[..., 0, n:] = past[..., 0, n:] + np.matvec(mean, joint_position - past[..., 0, :n])
+        new[..., 0, n:] = past[..., 0, n:] + np.matvec(mean, dq)
         return state._replace(past=new, base=base)
 
     def delay(self, state: PairState) -> FloatArray:
@@ -263,12 +292,17 @@ class Pairing:
 
     def past(self, state: PairState, joint_position: FloatArray, window: int) -> Past:
         """Return the past of an arm that is at `joint_position` (..., n), rad; `window` in periods."""
-        n, rows = self._n, self._candidates.exposed(state.past, state.candidate)
-        exposed, before = rows[..., 0, :], rows[..., 0, :] - rows[..., 1, :]
+        n = self._n
+        rows = self._candidates.exposed(state.past, state.candidate)
+        exposed = rows[..., 0, :]
+        before = exposed - rows[..., 1, :]
         since = state.past[..., 0, :] - exposed
-        moved, noise = joint_position - state.past[..., window, :n], state.regression.mean[..., -1]
         return Past(
-            exposed[..., :n], before[..., :n], (before[..., n:], since[..., n:]), moved, noise
+            exposed=exposed[..., :n],
+            before=before[..., :n],
+            predicted=(before[..., n:], since[..., n:]),
+            window=joint_position - state.past[..., window, :n],
+            noise=state.regression.mean[..., -1],
         )
 
     def noise(self, state: PairState) -> FloatArray | None:
@@ -287,34 +321,41 @@ class Pairing:
             valid: features that were measured at both ends, (..., m); others are taken to move as foreseen, the noise
                 of their last frame included.
         """
-        anchor, end = state.anchor, self._candidates.ends(state.past)
-        step, total = anchor.step + feature_step, anchor.duration + duration
-        since = anchor._replace(step=step, duration=total, valid=anchor.valid & valid)
-        first = self._candidates.begins(state.past, total / self._period)
-        miss = self._miss(None, since, first, pick(end, anchor.known.candidate)[..., None, :])
-        back = (miss < RETURN * anchor.miss) & np.logical_and.reduce(
-            since.valid == anchor.valid, axis=-1
+        motion = FeatureMotion(feature_step, duration, valid)
+        anchor = state.anchor
+        since = anchor._replace(
+            step=anchor.step + feature_step,
+            duration=anchor.duration + duration,
+            valid=anchor.valid & valid,
         )
-        state = branch(
-            back, lambda now, known: now._replace(**known._asdict()), state, anchor.known
-        )
-        motion = branch(
-            back,
-            lambda _, whole: whole,
-            (feature_step, duration, valid),
-            (step, total, since.valid),
-        )
-        periods, shorter = duration / self._period, (anchor.miss > 0.0) & ~back
+        end = self._candidates.ends(state.past)
+        begin_since = self._candidates.begins(state.past, since.duration / self._period)
+
+        # A frame is taken back if the motion past it, from the anchor, fits much better than the motion to it. Its miss
+        # is that of the delay that was known at the anchor.
+        end_known = pick(end, anchor.known.candidate)[..., None, :]
+        miss = self._least_miss(since, begin_since, end_known)
+        fits_better = miss < TAKE_BACK_RATIO * anchor.miss
+        same_features = np.logical_and.reduce(since.valid == anchor.valid, axis=-1)
+        back = fits_better & same_features
+        state = branch(back, _taken_back, state, anchor.known)
+        whole = FeatureMotion(since.step, since.duration, since.valid)
+        motion = choose(back, whole, motion)
+
+        # Where the anchor is the last frame, the motion since the anchor is the last motion, and its begin is known.
+        shorter = (anchor.miss > 0.0) & ~back
         begin = branch(
-            shorter, lambda _, *last: self._candidates.begins(*last), first, state.past, periods
+            shorter, self._begins_instead, begin_since, state.past, duration / self._period
         )
         state, paired = self._learned(state, motion, begin, end, back)
-        least, state = DOUBT * state.noise.variance, state.anchored()
-        doubtful = ~back & (total < self._doubtful) & (miss > least)
-        since = since._replace(miss=branch(doubtful, self._miss, miss, since, first, end))
-        anchor = branch(
-            doubtful & (since.miss > least), lambda _, older: older, state.anchor, since
-        )
+        state = state.anchored()
+
+        # A frame is doubtful if no delay explains the motion from the anchor to it. The least miss over all delays is
+        # only found where the miss of the known delay is large already.
+        least = DOUBT_GATE * state.noise.variance
+        suspect = ~back & (since.duration < self._longest_doubtful) & (miss > least)
+        miss = branch(suspect, self._least_miss_instead, miss, since, begin_since, end)
+        anchor = choose(suspect & (miss > least), since._replace(miss=miss), state.anchor)
         return state._replace(anchor=anchor), paired
 
     def _learned(
@@ -326,39 +367,51 @@ class Pairing:
         back: BoolArray,
     ) -> tuple[PairState, Paired]:
         """Return `learn` from a motion that is believed, with the past at both of its ends, (..., D, n + m)."""
-        n, (feature_step, duration, valid) = self._n, motion
+        n = self._n
         passed = end - begin
         h = np.concatenate([passed[..., n:], passed[..., :n]], axis=-1)
         now = pick(state.bank, state.candidate)[..., : self._m, :]
         foreseen = np.matvec(now[..., :-1], pick(h, state.candidate)) - now[..., -1]
-        state = self._find_delay(state, h, np.where(valid, feature_step, foreseen), valid)
-        begin, passed = pick(begin, state.candidate), pick(passed, state.candidate)
-        q, step, x = begin[..., :n], passed[..., :n], passed[..., n:]
-        h = self.regression.regressors(q + 0.5 * step, step, x)
-        paired = Paired(*motion, q, step, x, h, state.regression, back)
-        foreseen = (
-            self.regression.explained(state.regression, paired.h) - state.regression.mean[..., -1]
-        )
-        dy = np.where(valid, feature_step, foreseen)
-        regression = self.regression.update(
-            state.regression, paired.h, dy, duration, state.noise.variance
-        )
-        moved = regression.moves > state.regression.moves
+        dy = np.where(motion.valid, motion.feature_step, foreseen)
+        state = self._find_delay(state, h, dy, motion.valid)
+
+        begin = pick(begin, state.candidate)
+        passed = pick(passed, state.candidate)
+        q = begin[..., :n]
+        dq = passed[..., :n]
+        x = passed[..., n:]
+        before = state.regression
+        h = self.regression.regressors(q + 0.5 * dq, dq, x)
+        paired = Paired(*motion, q, dq, x, h, before, back)
+
+        foreseen = self.regression.explained(before, h) - before.mean[..., -1]
+        dy = np.where(motion.valid, motion.feature_step, foreseen)
+        regression = self.regression.update(before, h, dy, motion.duration, state.noise.variance)
+        moved = regression.moves > before.moves
         state = branch(moved, self._forget, state._replace(regression=regression))
         return state, paired
 
-    def _miss(
-        self, _: FloatArray | None, since: Anchor, begin: FloatArray, end: FloatArray
+    def _begins_instead(self, _: FloatArray, past: FloatArray, periods: FloatArray) -> FloatArray:
+        return self._candidates.begins(past, periods)
+
+    def _least_miss_instead(
+        self, _: FloatArray, since: Anchor, begin: FloatArray, end: FloatArray
     ) -> FloatArray:
+        return self._least_miss(since, begin, end)
+
+    def _least_miss(self, since: Anchor, begin: FloatArray, end: FloatArray) -> FloatArray:
         """Return the least ‖ν‖², (...), of the motion from `begin` by the delay to each `end`, (..., *, n + m)."""
-        n, m, known = self._n, self._m, since.known
+        n = self._n
+        m = self._m
+        known = since.known
         passed = end - pick(begin, known.candidate)[..., None, :]
+        dq = passed[..., :n]
+        x = passed[..., n:]
         W = pick(known.bank, known.candidate)[..., None, :m, :]
-        foreseen = (
-            np.matvec(W[..., :m], passed[..., n:])
-            + np.matvec(W[..., m:-1], passed[..., :n])
-            - W[..., -1]
-        )
+        M = W[..., :m]
+        E = W[..., m:-1]
+        e = W[..., -1]
+        foreseen = np.matvec(M, x) + np.matvec(E, dq) - e
         nu = np.where(since.valid[..., None, :], since.step[..., None, :] - foreseen, 0.0)
         return np.asarray(np.minimum.reduce(np.vecdot(nu, nu), axis=-1))
 
@@ -370,48 +423,60 @@ class Pairing:
 
     def diagnostics(self, state: PairState) -> dict[str, npt.ArrayLike]:
         """Return delay [s], noise, NIS, moves of the camera, rotation [rad] of the map, and the deviation of E."""
-        regression, R = state.regression, state.regression.rotation
+        regression = state.regression
+        R = regression.rotation
+        # ‖R − I‖² = 4 (1 − cos φ) for a rotation by φ about one axis.
         turned = (R - np.eye(self._m)).reshape(*R.shape[:-2], -1)
+        cosine = 1.0 - 0.25 * np.vecdot(turned, turned)
         return {
             "delay": self.delay(state) * self._period,
             "noise_level": state.noise.deviation,
             "model_surprise": state.nis,
             "camera_moves": regression.moves,
-            "map_rotation": np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0)),
+            "map_rotation": np.arccos(np.maximum(cosine, -1.0)),
             "model_deviation": self.regression.deviation(regression),
         }
 
     def _forget(self, state: PairState) -> PairState:
         """Return the state in which any map is possible."""
-        bank = fresh_bank(
-            state.bank[..., : self._m, :-1], self._variances, state.noise.variance[..., None]
-        )
+        W = state.bank[..., : self._m, :-1]
+        bank = fresh_bank(W, self._variances, state.noise.variance[..., None])
         return state._replace(bank=bank)
 
     def _find_delay(
         self, state: PairState, h: FloatArray, feature_step: FloatArray, valid: BoolArray
     ) -> PairState:
         """Update filter and score of every delay, choose among them, and learn the noise."""
-        aids, m, candidate, frame = self._aids, self._m, state.candidate, state.noise.variance
-        lengths, turns = norm(h[..., :m]), norm(h[..., m:])
-        steps = np.repeat(
-            np.stack([MAP_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1), (m, self._n), axis=-1
-        )
-        model = MODEL_ERROR**2 * (lengths * lengths)
+        m = self._m
+        frame = state.noise.variance
+        lengths = norm(h[..., :m])
+        turns = norm(h[..., m:])
+        walks = np.stack([MAP_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1)
+        walk = np.repeat(walks, (m, self._n), axis=-1)
+        unexplained = UNEXPLAINED_SHARE**2 * (lengths * lengths)
         learns = lengths * lengths >= frame[..., None]
-        bank, innovations = learn(state.bank, h, feature_step, frame, model, steps, learns)
-        now: Innovation = of_filter(innovations, candidate)
-        noise, count = state.noise, np.add.reduce(valid, axis=-1)
-        if aids.noise == "identified":
-            noise = noise.learn(now.square, count, now.frames, now.variance - now.frames * frame)
+        bank, innovations = learn(state.bank, h, feature_step, frame, unexplained, walk, learns)
+
+        now: Innovation = of_filter(innovations, state.candidate)
+        count = np.add.reduce(valid, axis=-1)
+        noise = state.noise
+        if self._aids.noise == "identified":
+            rest = now.variance - now.frames * frame
+            noise = noise.learn(now.square, count, now.frames, rest)
+
         counts = self._is_informative(h, lengths, noise)[..., None]
         evidence = innovations.square / innovations.capped + m * np.log(innovations.capped)
-        scores = aids.score_memory * state.scores + evidence * counts
+        scores = self._aids.score_memory * state.scores + evidence * counts
         best = scores.argmin(axis=-1)
-        better = pick(scores, best) < pick(scores, candidate) - aids.delay_margin
-        candidate = np.where(better, best, candidate)[()]
-        nis = now.square / (now.variance * np.maximum(count, 1))
-        return state._replace(bank=bank, scores=scores, noise=noise, candidate=candidate, nis=nis)
+        present = pick(scores, state.candidate)
+        better = pick(scores, best) < present - self._aids.delay_margin
+        return state._replace(
+            bank=bank,
+            scores=scores,
+            noise=noise,
+            candidate=np.where(better, best, state.candidate)[()],
+            nis=now.square / (now.variance * np.maximum(count, 1)),
+        )
 
     def _is_informative(self, h: FloatArray, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
         """Return whether a motion counts in the scores, (...).
@@ -421,9 +486,13 @@ class Pairing:
         """
         x = h[..., : self._m]
         changes = norm(x - x[..., self._candidates.beside, :])
-        change, length = (np.maximum.reduce(each, axis=-1) for each in (changes, lengths))
-        error = MODEL_ERROR * length
-        return np.asarray(
-            (change >= MIN_CHANGE_RATIO * noise.deviation)
-            | (error < MAX_BIAS_RATIO * noise.deviation)
-        )
+        change = np.maximum.reduce(changes, axis=-1)
+        error = UNEXPLAINED_SHARE * np.maximum.reduce(lengths, axis=-1)
+        differs = change >= MIN_CHANGE_RATIO * noise.deviation
+        unbiased = error < MAX_BIAS_RATIO * noise.deviation
+        return np.asarray(differs | unbiased)
+
+
+def _taken_back(state: PairState, known: Identified) -> PairState:
+    """Return the state with what was identified at the anchor."""
+    return state._replace(**known._asdict())

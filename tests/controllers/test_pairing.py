@@ -120,7 +120,7 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
         assert (lengths[d:] > sigma).all()
         S = sigma**2 * (2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
         S += (
-            np.diag((pairing.MODEL_ERROR * lengths) ** 2)
+            np.diag((pairing.UNEXPLAINED_SHARE * lengths) ** 2)
             + pairing.MAP_DEVIATION**2 * H[:, :M] @ H[:, :M].T
         )
         S += pairing.REST_DEVIATION**2 * H[:, M:] @ H[:, M:].T
