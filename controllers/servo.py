@@ -28,10 +28,10 @@ from servobench.plant.contract.signals import BoolArray, Command, Observation
 class ServoState(NamedTuple):
     """The state of a composed controller."""
 
-    estimation: EstimationState  # of the pair and estimate stages
-    law: Any  # of the law
-    initial: Any  # of the provider of the initial Jacobian
-    predictor: Any  # of the predict stage; None without one
+    estimation: EstimationState  # state of the pair and estimate stages
+    law: Any  # state of the law
+    initial: Any  # state of the provider of the initial Jacobian
+    predictor: Any  # state of the predict stage; None without one
     ready: BoolArray  # (...), whether the initial Jacobian is known
     limited: BoolArray  # (...), whether the last command was limited
 
@@ -39,6 +39,13 @@ class ServoState(NamedTuple):
     def jacobian(self) -> FloatArray:
         """Ĵ of the last step, (..., m, n), in the units of the parts; NaN before."""
         return self.estimation.jacobian
+
+
+class Stepped(NamedTuple):
+    """A state and the command of its period, which each lane gets from probing or from the law."""
+
+    state: ServoState
+    joint_velocity: FloatArray  # (..., n), rad/s
 
 
 @final
@@ -79,28 +86,33 @@ class Servo:
                 f"aids: {type(law).__name__} predicts by itself; leave delay, response and filter off"
             )
         delays = knowledge.true_delays or Delays(aids.latency, aids.command_delay, aids.lag)
-        self.knowledge, self.law, self.initial = knowledge, law, initial
+        self.knowledge = knowledge
+        self.law = law
+        self.initial = initial
         self.estimation = Estimation(estimator, knowledge, aids, delays)
         self.predictor = Predictor(aids, knowledge.spec.period, delays) if predicts else None
         self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
-        self._feeds_forward, self._turns = (
-            aids.feedforward,
-            law.in_model_frame and aids.model == "regression",
-        )
-        self._rows = 1 + knowledge.preview if "preview" in law.owns else 1 + int(aids.feedforward)
+        self._feeds_forward = aids.feedforward
+        self._turns = law.in_model_frame and aids.model == "regression"
+        # Feedforward needs the row of the next instant, too.
+        self._rows = 1 + int(aids.feedforward)
+        if "preview" in law.owns:
+            self._rows = 1 + knowledge.preview
         self._unit = knowledge.unit
 
     def start(self, observation: Observation) -> ServoState:
         """Return the state at the start of a run that begins with `observation`, in the unit of the plant."""
         observation = self._natural(observation)
-        initial, known = self.initial.start(observation), self.initial.immediate
-        lead, spec = observation.feature.shape[:-1], self.knowledge.spec
-        first = self.initial.jacobian(initial) if known else np.zeros((*lead, spec.m, spec.n))
-        return self._begin(initial, np.full(lead, known)[()], observation, first)
+        initial = self.initial.start(observation)
+        known = self.initial.immediate
+        lead = observation.feature.shape[:-1]
+        if known:
+            jacobian = self.initial.jacobian(initial)
+        else:
+            jacobian = np.zeros((*lead, self.knowledge.spec.m, self.knowledge.spec.n))
+        return self._begin(initial, np.full(lead, known)[()], observation, jacobian)
 
-    def step(
-        self, state: ServoState, observation: Observation, reference: FloatArray
-    ) -> tuple[ServoState, FloatArray]:
+    def step(self, state: ServoState, observation: Observation, reference: FloatArray) -> Stepped:
         """Return the new state and the joint velocity (..., n) [rad/s] for the period that begins now.
 
         Raises:
@@ -108,12 +120,13 @@ class Servo:
             RunFault: a part cannot go on in at least one lane.
         """
         if self._unit != 1.0:
-            observation, reference = self._natural(observation), reference / self._unit
+            observation = self._natural(observation)
+            reference = reference / self._unit
         if self.initial.immediate:
-            return self._act((state, observation.joint_position), observation, reference)
-        both = state, np.zeros_like(observation.joint_position)
-        both = branch(np.logical_not(state.ready), self._probe, both, observation)
-        return branch(both[0].ready, self._act, both, observation, reference)
+            return self._act(Stepped(state, observation.joint_position), observation, reference)
+        stepped = Stepped(state, np.zeros_like(observation.joint_position))
+        stepped = branch(np.logical_not(state.ready), self._probe, stepped, observation)
+        return branch(stepped.state.ready, self._act, stepped, observation, reference)
 
     def jacobian(self, state: ServoState) -> FloatArray:
         """Return Ĵ of the last step, (..., m, n), in the unit of the plant per rad; NaN before."""
@@ -122,21 +135,15 @@ class Servo:
     def _natural(self, observation: Observation) -> Observation:
         return observation.with_values(observation.joint_position, observation.feature / self._unit)
 
-    def _probe(
-        self, both: tuple[ServoState, FloatArray], observation: Observation
-    ) -> tuple[ServoState, FloatArray]:
-        initial, velocity, done = self.initial.step(both[0].initial, observation)
-        return branch(
-            done, self._end_probing, both[0]._replace(initial=initial), observation
-        ), velocity
+    def _probe(self, stepped: Stepped, observation: Observation) -> Stepped:
+        """Make a probing move in lanes without an initial Jacobian; the last one ends with the law's command."""
+        initial, velocity, done = self.initial.step(stepped.state.initial, observation)
+        state = stepped.state._replace(initial=initial)
+        return Stepped(branch(done, self._end_probing, state, observation), velocity)
 
     def _end_probing(self, state: ServoState, observation: Observation) -> ServoState:
-        return self._begin(
-            state.initial,
-            np.ones_like(state.ready),
-            observation,
-            self.initial.jacobian(state.initial),
-        )
+        jacobian = self.initial.jacobian(state.initial)
+        return self._begin(state.initial, np.ones_like(state.ready), observation, jacobian)
 
     def _begin(
         self,
@@ -154,35 +161,37 @@ class Servo:
             limited=np.zeros_like(ready)[()],
         )
 
-    def _act(
-        self, both: tuple[ServoState, FloatArray], observation: Observation, reference: FloatArray
-    ) -> tuple[ServoState, FloatArray]:
-        state, _ = both
+    def _act(self, stepped: Stepped, observation: Observation, reference: FloatArray) -> Stepped:
+        """Estimate, predict and command in lanes whose initial Jacobian is known."""
+        state = stepped.state
         estimation = self.estimation.update(state.estimation, observation, reference[..., 0, :])
         J = estimation.jacobian
         if not is_finite(J):
             raise ControllerDiverged(
                 f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}"
             )
-        predictor, ahead, later = state.predictor, observation, reference
+        predictor = state.predictor
+        ahead = observation
+        later = reference
         if self.predictor is not None:
             predictor, ahead, lead, J = self.predictor.predict(
                 predictor, self.estimation, estimation, observation
             )
             later = shifted(reference, lead, self._rows)
-        forward = later[..., 1, :] - later[..., 0, :] if self._feeds_forward else np.zeros(())
         law, wanted = self._command(state, estimation, J, ahead, later)
         if not is_finite(wanted):
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {wanted.tolist()}, by the Jacobian "
                 f"{J.tolist()}"
             )
+        forward = later[..., 1, :] - later[..., 0, :] if self._feeds_forward else np.zeros(())
         u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
         u = self.law.restrained(law, wanted, u)
         law = self.law.noted(law, u, limited)
         if self.predictor is not None:
             predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)
-        return ServoState(estimation, law, state.initial, predictor, state.ready, limited), u
+        new = ServoState(estimation, law, state.initial, predictor, state.ready, limited)
+        return Stepped(new, u)
 
     def _command(
         self,
@@ -198,7 +207,8 @@ class Servo:
         """
         if self._turns:
             T = self.estimation.into_model_frame(estimation)
-            J, reference = T @ J, reference @ T.mT
+            J = T @ J
+            reference = reference @ T.mT
             ahead = ahead.with_values(ahead.joint_position, np.vecmat(ahead.feature, T.mT))
         return self.law.command(state.law, Estimate(J), ahead, reference)
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.choice import choose
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
 from servobench.controllers.periods import whole_periods
@@ -40,9 +41,8 @@ class Learned(NamedTuple):
     estimator: Any  # state of the estimator
     anchor: Any  # its state at the pair stage's anchor, which returns if later frames were false
     pair: Any  # state of the pair stage; None without one
-    unexplained: (
-        FloatArray  # ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion
-    )
+    # ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion
+    unexplained: FloatArray
 
 
 class EstimationState(NamedTuple):
@@ -51,7 +51,7 @@ class EstimationState(NamedTuple):
     learned: Learned  # from motions
     last: LastFrame  # the frame at which the last motion ended
     jacobian: FloatArray  # Ĵ, (..., m, n), of this period; NaN before
-    own: FloatArray  # the part of it that is the estimator's
+    own: FloatArray  # the part of Ĵ that is the estimator's
 
 
 @final
@@ -67,31 +67,38 @@ class Estimation:
         self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays
     ) -> None:
         """Compose the stages."""
-        self.estimator, self._model = estimator, aids.model
-        period, self._filters = knowledge.spec.period, aids.filter
-        self._shortest = (max(1, whole_periods(MOTION_TIME, period)) - 0.5) * period
-        self.pairing = Pairing(aids, knowledge, delays.latency) if aids.needs_past else None
+        spec = knowledge.spec
+        period = spec.period
+        self.estimator = estimator
+        self._model = aids.model
+        self._filters = aids.filter
         self._nominal = knowledge.nominal_jacobian
         self._uses_own = estimator.brings_model and aids.model == "own"
-        shape = knowledge.spec.m, knowledge.spec.n
-        self._first = (
-            estimator.start(np.zeros(shape))
-            if estimator.brings_model and aids.model != "own"
-            else None
-        )
-        self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * period
+        # Half a period keeps rounding of times out of the comparison with a motion's duration.
+        self._shortest = (max(1, whole_periods(MOTION_TIME, period)) - 0.5) * period
+        self._longest = math.inf
+        self.pairing: Pairing | None = None
+        if aids.needs_past:
+            self.pairing = Pairing(aids, knowledge, delays.latency)
+            self._longest = (self.pairing.gap + 0.5) * period
+        self._first = None
+        if estimator.brings_model and aids.model != "own":
+            self._first = estimator.start(np.zeros((spec.m, spec.n)))
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:
         """Return the state before any motion, starting from Ĵ₀, (..., m, n), at rest."""
-        lead, q = observation.feature.shape[:-1], observation.joint_position
+        lead = observation.feature.shape[:-1]
+        q = observation.joint_position
         base = self._given(q, jacobian)
         estimator = self.estimator.start(jacobian if self._model == "own" else jacobian - base)
         if self._uses_own:
             base = self.estimator.jacobian(estimator, q)
         pair = None if self.pairing is None else self.pairing.start(observation, base)
-        unknown, never = np.full(jacobian.shape, np.nan), np.full(lead, np.nan)[()]
+        unknown = np.full(jacobian.shape, np.nan)
+        never = np.full(lead, np.nan)[()]
+        learned = Learned(estimator, anchor=estimator, pair=pair, unexplained=never)
         last = LastFrame(never, q, observation.feature, observation.valid, unknown)
-        return EstimationState(Learned(estimator, estimator, pair, never), last, unknown, unknown)
+        return EstimationState(learned, last, jacobian=unknown, own=unknown)
 
     def update(
         self, state: EstimationState, observation: Observation, desired: FloatArray
@@ -103,44 +110,42 @@ class Estimation:
             observation: of this period.
             desired: y_ref, (..., m), of this period.
         """
-        learned, last, q = state.learned, state.last, observation.joint_position
+        learned = state.learned
+        last = state.last
+        q = observation.joint_position
         if self.pairing is not None:
-            before = learned.pair.base
-            base = (
-                self.estimator.jacobian(learned.estimator, q)
-                if self._uses_own
-                else self._given(q, before)
-            )
+            base = self._base(learned, q)
             learned = learned._replace(pair=self.pairing.advance(learned.pair, q, base))
-        duration, both = observation.time - last.time, observation.valid & last.valid
-        # not "duration >= shortest": that of the first frame is NaN
-        due = np.logical_or.reduce(observation.valid, axis=-1) & ~(duration < self._shortest)
-        known = (
-            due
-            & np.logical_or.reduce(both, axis=-1)
-            & (duration > 0.0)
-            & (duration < self._longest)
-        )
-        learned = branch(known, self._learn, learned, last, observation, desired, both)
+
+        # The duration of the first frame is NaN, and that frame is due: hence "not shorter" instead of "at least".
+        duration = observation.time - last.time
+        shorter = duration < self._shortest
+        due = np.logical_or.reduce(observation.valid, axis=-1) & ~shorter
+        valid = observation.valid & last.valid
+        ends_motion = due & np.logical_or.reduce(valid, axis=-1)
+        known = ends_motion & (duration > 0.0) & (duration < self._longest)
+        learned = branch(known, self._learn, learned, last, observation, desired, valid)
         if self.pairing is not None:
             pair = branch(due & np.logical_not(known), self.pairing.interrupt, learned.pair)
-            anchor = branch(pair.anchor.miss == 0.0, _other, learned.anchor, learned.estimator)
+            believed = pair.anchor.miss == 0.0
+            anchor = choose(believed, learned.estimator, learned.anchor)
             learned = learned._replace(anchor=anchor, pair=pair)
+
         own = self.estimator.deviation(learned.estimator, self._first, q)
-        jacobian = (
-            own if self.pairing is None else self._with_model(own, learned, q, learned.pair.base)
-        )
+        jacobian = own
+        if self.pairing is not None:
+            jacobian = self._with_model(own, learned, q, learned.pair.base)
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
         this = LastFrame(time, q, observation.feature, observation.valid, jacobian)
-        last = branch(due, lambda _, newer: newer, last, this)
-        return EstimationState(learned, last, jacobian, own)
+        return EstimationState(learned, choose(due, this, last), jacobian, own)
 
     def ahead(
         self, state: EstimationState, joint_position: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return Ĵ by the state at any joint position, (..., n) rad, and the model's J_n there, (..., m, n) each."""
-        learned, q = state.learned, joint_position
+        learned = state.learned
+        q = joint_position
         if self._uses_own:
             whole: FloatArray = self.estimator.jacobian(learned.estimator, q)
             return whole, whole
@@ -165,20 +170,28 @@ class Estimation:
         """
         if self._uses_own:
             return predicted
-        own, pair = np.matvec(state.own, joint_step), state.learned.pair
+        own = np.matvec(state.own, joint_step)
         if self._model == "nominal":
             return np.asarray(predicted + own)
         if self._model == "own" or self.pairing is None:
             return np.asarray(own)
-        h = self.pairing.regression.regressors(begin + 0.5 * joint_step, joint_step, predicted)
-        return np.asarray(self.pairing.regression.explained(pair.regression, h) + own)
+        regression = self.pairing.regression
+        h = regression.regressors(begin + 0.5 * joint_step, joint_step, predicted)
+        return np.asarray(regression.explained(state.learned.pair.regression, h) + own)
 
     def into_model_frame(self, state: EstimationState) -> FloatArray:
         """Return Rᵀ, (..., m, m), that turns measured features into those of the nominal cameras."""
         rotation: FloatArray = state.learned.pair.regression.rotation
         return rotation.mT
 
+    def _base(self, learned: Learned, joint_position: FloatArray) -> FloatArray:
+        """Return J_n of the pair stage at a joint position, (..., m, n)."""
+        if self._uses_own:
+            return self.estimator.jacobian(learned.estimator, joint_position)
+        return self._given(joint_position, learned.pair.base)
+
     def _given(self, joint_position: FloatArray, otherwise: FloatArray) -> FloatArray:
+        """Return the nominal Jacobian at a joint position, (..., m, n), or `otherwise` where there is none."""
         if self._nominal is None:
             return otherwise
         return np.asarray(self._nominal(joint_position), dtype=np.float64)
@@ -204,28 +217,42 @@ class Estimation:
         valid: BoolArray,
     ) -> Learned:
         """Learn from a motion; features that were not `valid` at both ends are taken to move as predicted."""
-        error, pairing, noise = desired - observation.feature, self.pairing, None
-        dy, duration = observation.feature - last.feature, observation.time - last.time
-        q, pair, explained = last.joint_position, learned.pair, np.zeros_like(dy)
-        step = observation.joint_position - q
-        if pairing is not None:
-            pair, paired = pairing.learn(pair, dy, duration, valid)
-            dy, duration, valid, q, step, x, h, before, back = paired
-            learned = learned._replace(
-                estimator=branch(back, _other, learned.estimator, learned.anchor)
-            )
-            noise = pairing.noise(pair)
+        q = last.joint_position
+        dq = observation.joint_position - q
+        dy = observation.feature - last.feature
+        duration = observation.time - last.time
+        pair = learned.pair
+        noise = None
+        explained = np.zeros_like(dy)
+        if self.pairing is not None:
+            pair, paired = self.pairing.learn(pair, dy, duration, valid)
+            q = paired.joint_position
+            dq = paired.joint_step
+            dy = paired.feature_step
+            duration = paired.duration
+            valid = paired.valid
+            estimator = choose(paired.back, learned.anchor, learned.estimator)
+            learned = learned._replace(estimator=estimator)
+            noise = self.pairing.noise(pair)
             if self._filters:
-                dy = dy - (pair.regression.mean[..., -1] - before.mean[..., -1])
-            if self._model != "own":
-                explained = (
-                    x if self._model == "nominal" else pairing.regression.explained(before, h)
-                )
+                dy = dy - (pair.regression.mean[..., -1] - paired.before.mean[..., -1])
+            if self._model == "nominal":
+                explained = paired.predicted
+            elif self._model == "regression":
+                explained = self.pairing.regression.explained(paired.before, paired.h)
             if self._first is not None:
-                explained = explained - np.matvec(self.estimator.jacobian(self._first, q), step)
-        predicted = np.matvec(last.jacobian, step)
+                explained = explained - np.matvec(self.estimator.jacobian(self._first, q), dq)
+
+        predicted = np.matvec(last.jacobian, dq)
         dy = np.where(valid, dy, predicted)
-        motion = Motion(q, step, dy - explained, error, duration, noise)
+        motion = Motion(
+            joint_position=q,
+            joint_step=dq,
+            feature_step=dy - explained,
+            error=desired - observation.feature,
+            duration=duration,
+            noise=noise,
+        )
         estimator = self.estimator.update(learned.estimator, motion)
         return learned._replace(estimator=estimator, pair=pair, unexplained=norm(dy - predicted))
 
@@ -236,10 +263,6 @@ class Estimation:
             "jacobian_prediction_error": learned.unexplained,
             **self.estimator.diagnostics(learned.estimator),
         }
-        return (
-            found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}
-        )
-
-
-def _other(_: Any, other: Any) -> Any:  # noqa: ANN401 - states of an estimator
-    return other
+        if self.pairing is None:
+            return found
+        return {**found, **self.pairing.diagnostics(learned.pair)}

@@ -41,21 +41,23 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.estimation import Estimation, EstimationState
+from servobench.controllers.stages.pairing import Past
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import Observation
 
-WINDOW = 0.05  # [s] over which motions are compared, and no shorter than a period; steps of encoders spoil shorter ones
-PRIOR_WEIGHT = (
-    2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some milliradians outweighs it
-)
+# [s] Motions are compared over this time, and over a period at least: steps of encoders spoil shorter ones.
+WINDOW = 0.05
+# [rad²/s] ρ_1 for windows that last a second in all; one step of some milliradians outweighs it.
+PRIOR_WEIGHT = 2e-4
 PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
 MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
-PREDICTION_TOLERANCE = (
-    0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
-)
+# [rad/s] Nothing is learned from smaller errors: they are 0.3 mm at the ball in 0.05 s.
+PREDICTION_TOLERANCE = 0.01
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
-MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that does not overshoot
+# [1] Largest g_i, which lies between 0 and 1 for a joint that does not overshoot.
+MAX_RESPONSE = 1.5
+MIN_TOTAL_RESPONSE = 0.5  # [1] least Σ g_i by which a lead is known; below, it counts as 0
 
 
 class JointResponse(NamedTuple):
@@ -83,13 +85,19 @@ class JointResponse(NamedTuple):
             window: w, periods.
         """
         *lead, n = joint_position.shape
-        weights = (
-            PRIOR_WEIGHT * window**2 * period * np.exp(PRIOR_GROWTH * period * np.arange(length))
-        )
+        growth = np.exp(PRIOR_GROWTH * period * np.arange(length))
+        weights = PRIOR_WEIGHT * window**2 * period * growth
         first = np.broadcast_to(np.eye(length)[0], (*lead, length))
-        A = np.broadcast_to(np.diag(weights), (*lead, length, length))
-        commands = np.zeros((*lead, length + window - 1, n))
-        state = cls(A, weights[0] * first, commands, first, first, np.zeros(lead), window, period)
+        state = cls(
+            A=np.broadcast_to(np.diag(weights), (*lead, length, length)),
+            b=weights[0] * first,
+            commands=np.zeros((*lead, length + window - 1, n)),
+            response=first,
+            left=first,
+            lead=np.zeros(lead),
+            window=window,
+            period=period,
+        )
         return with_response(state, first)
 
     @classmethod
@@ -107,9 +115,17 @@ class JointResponse(NamedTuple):
         """
         *lead, n = joint_position.shape
         left = np.broadcast_to(remaining_share(delay, lag, period, length), (*lead, length))
-        arrival = np.full(tuple(lead), np.add.reduce(left, axis=-1))[()]
-        nothing, commands = np.zeros((*lead, 0)), np.zeros((*lead, length, n))
-        return cls(nothing[..., None], nothing, commands, nothing, left, arrival, 1, period)
+        nothing = np.zeros((*lead, 0))
+        return cls(
+            A=nothing[..., None],
+            b=nothing,
+            commands=np.zeros((*lead, length, n)),
+            response=nothing,
+            left=left,
+            lead=np.full(tuple(lead), np.add.reduce(left, axis=-1))[()],
+            window=1,
+            period=period,
+        )
 
     def command(self, joint_step: FloatArray) -> JointResponse:
         """Return the state after the joint step (..., n), rad, was commanded."""
@@ -137,16 +153,18 @@ class JointResponse(NamedTuple):
 
 
 def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) -> JointResponse:
-    weight = 1.0 / state.window  # windows overlap
+    """Return the response with the joint step of one more window; as in `JointResponse.learn`."""
+    # Windows overlap: each command is in `window` of them.
+    weight = 1.0 / state.window
     A = state.A + weight * (steps @ steps.mT)
     b = state.b + weight * np.matvec(steps, joint_step)
     most = MAX_EXCITATION * state.window**2 * state.period
     kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]
-    A, b = kept[..., None] * A, kept * b
+    A = kept[..., None] * A
+    b = kept * b
     response = np.linalg.solve(A, b[..., None])[..., 0]
-    if (
-        state.window == 1
-    ):  # in longer windows single entries are not identified, and limits would shift their sum
+    # In longer windows single entries are not identified, and limits would shift their sum.
+    if state.window == 1:
         response = np.minimum(np.maximum(response, 0.0), MAX_RESPONSE)
     return with_response(state._replace(A=A, b=b), response)
 
@@ -157,10 +175,9 @@ def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
     left = np.zeros_like(ahead)
     left[..., :-1] = ahead[..., 1:]
     total = ahead[..., 0]
-    lead = np.add.reduce(left, axis=-1) / np.maximum(total, 0.5)
-    return state._replace(
-        response=response, left=left, lead=np.minimum(lead, response.shape[-1]) * (total > 0.5)
-    )
+    lead = np.add.reduce(left, axis=-1) / np.maximum(total, MIN_TOTAL_RESPONSE)
+    lead = np.minimum(lead, response.shape[-1]) * (total > MIN_TOTAL_RESPONSE)
+    return state._replace(response=response, left=left, lead=lead)
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:
@@ -169,13 +186,17 @@ def remaining_share(delay: float, lag: float, period: float, length: int) -> Flo
     A velocity held for one period acts after the delay through v̇ = (u − v)/lag, so that after a time T of action the
     joint has gone (f(T) − f(T − dt))/dt of its step, f(T) = T − lag (1 − exp(−T/lag)) for T > 0.
     """
-    acted: FloatArray = np.asarray(period * (1.0 + np.arange(length)) - delay)
+    periods = 1.0 + np.arange(length)
+    acted: FloatArray = np.asarray(period * periods - delay)
 
     def travelled(time: FloatArray) -> FloatArray:
         acting = np.maximum(time, 0.0)
-        return np.asarray(acting if lag == 0.0 else acting + lag * np.expm1(-acting / lag))
+        if lag == 0.0:
+            return np.asarray(acting)
+        return np.asarray(acting + lag * np.expm1(-acting / lag))
 
-    return np.asarray(1.0 - (travelled(acted) - travelled(acted - period)) / period)
+    arrived = (travelled(acted) - travelled(acted - period)) / period
+    return np.asarray(1.0 - arrived)
 
 
 def pushed(history: FloatArray, newest: FloatArray) -> FloatArray:
@@ -186,7 +207,7 @@ def pushed(history: FloatArray, newest: FloatArray) -> FloatArray:
 class PredictorState(NamedTuple):
     """The state of the predict stage."""
 
-    response: JointResponse  # of the joints
+    response: JointResponse  # identified or given response of the joints
     feature: FloatArray  # z, (..., m), m
 
 
@@ -200,10 +221,12 @@ class Predictor:
 
     def __init__(self, aids: AidsConfig, period: float, delays: Delays) -> None:
         """Take the settings, the period [s], and the delays of a given response."""
-        self._aids, self._period, self._delays = aids, period, delays
+        self._aids = aids
+        self._period = period
+        self._delays = delays
         self.window = max(1, whole_periods(WINDOW, period))
-        self._share: float | None = None
         self._length = max(1, whole_periods(aids.response_length, period))
+        self._share: float | None = None
 
     def frozen(self, share: float) -> Self:
         """Return a copy that predicts from a state of this stage with identification switched off.
@@ -211,19 +234,21 @@ class Predictor:
         Args:
             share: of a frame's innovation that is noise, which the filter takes from every frame.
         """
-        aids, other = self._aids, copy.copy(self)
-        other._aids = replace(
-            aids, response=aids.response if aids.response == "ignored" else "given"
-        )
+        response = self._aids.response
+        frozen = replace(self._aids, response=response if response == "ignored" else "given")
+        other = copy.copy(self)
+        other._aids = frozen
         other._share = share
         return other
 
     def start(self, observation: Observation) -> PredictorState:
         """Return the state of an arm at rest."""
-        q, delays = observation.joint_position, self._delays
+        q = observation.joint_position
         if self._aids.response == "given":
-            count = 1 + math.ceil((delays.command_delay + SETTLED_LAGS * delays.lag) / self._period)
-            response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
+            delay = self._delays.command_delay
+            lag = self._delays.lag
+            count = 1 + math.ceil((delay + SETTLED_LAGS * lag) / self._period)
+            response = JointResponse.given(delay, lag, self._period, count, q)
         else:
             response = JointResponse.immediate(self._length, q, self._period, self.window)
         return PredictorState(response, observation.feature)
@@ -243,35 +268,51 @@ class Predictor:
             estimation: their state of this period.
             observation: of this period.
         """
-        q, pairing = observation.joint_position, stages.pairing
-        if pairing is None:
+        if stages.pairing is None:
             raise ValueError("aids: a stage that predicts needs the pair stage")
-        past = pairing.past(estimation.learned.pair, q, self.window)
-        response, bound, lead = state.response, q, np.zeros(q.shape[:-1])[()]
+        q = observation.joint_position
+        past = stages.pairing.past(estimation.learned.pair, q, self.window)
+
+        # The joint positions that the arm is bound to reach, and when.
+        response = state.response
+        bound = q
+        lead = np.zeros(q.shape[:-1])[()]
+        if self._aids.response == "identified":
+            response = response.learn(past.window)
         if self._aids.response != "ignored":
-            response = (
-                response.learn(past.window) if self._aids.response == "identified" else response
-            )
-            bound, lead = q + response.flight(), response.lead
+            bound = q + response.flight()
+            lead = response.lead
+
         z = observation.feature
         if self._aids.filter:
-            moved = stages.motion(
-                estimation, past.exposed - past.before, past.before, past.predicted[0]
-            )
-            expected, noise = state.feature + moved, past.noise
-            learned = np.equal(estimation.last.time, observation.time)
-            if self._share is not None:
-                noise, learned = (
-                    self._share * (z - expected),
-                    np.full_like(learned, fill_value=True),
-                )
-            z = np.where(learned[..., None] & observation.valid, z - noise, expected)
+            z = self._filtered(state, stages, estimation, observation, past)
+
+        # From the exposure the arm moved to q, and will move on to `bound`, along which J_n is the mean of both ends.
         J, nominal = stages.ahead(estimation, bound)
         flight = 0.5 * np.matvec(estimation.learned.pair.base + nominal, bound - q)
         feature = z + stages.motion(
             estimation, past.exposed, bound - past.exposed, past.predicted[1] + flight
         )
         return PredictorState(response, z), observation.with_values(bound, feature), lead, J
+
+    def _filtered(
+        self,
+        state: PredictorState,
+        stages: Estimation,
+        estimation: EstimationState,
+        observation: Observation,
+        past: Past,
+    ) -> FloatArray:
+        """Return z, (..., m): features without their noise, and expected ones where no frame was learned from."""
+        begin = past.exposed - past.before
+        expected = state.feature + stages.motion(estimation, begin, past.before, past.predicted[0])
+        noise = past.noise
+        learned = np.equal(estimation.last.time, observation.time)
+        if self._share is not None:
+            noise = self._share * (observation.feature - expected)
+            learned = np.full_like(learned, fill_value=True)
+        believed = learned[..., None] & observation.valid
+        return np.where(believed, observation.feature - noise, expected)
 
     def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
         """Return the state after the joint step (..., n), rad, left the chain."""
@@ -289,15 +330,17 @@ def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:
         rows: how many instants are wanted, at most 1 + preview.
     """
     now = reference[..., :rows, :]
-    return (
-        branch(lead > 0.0, _interpolated, now, reference, lead) if reference.shape[-2] > 1 else now
-    )
+    if reference.shape[-2] == 1:
+        return now
+    return branch(lead > 0.0, _interpolated, now, reference, lead)
 
 
 def _interpolated(now: FloatArray, reference: FloatArray, lead: FloatArray) -> FloatArray:
     """Return y_0 + Σ_j s_j (y_{j+1} − y_j), (..., rows, m), with s_j the share of segment j that has passed."""
-    segments = reference.shape[-2] - 1
-    passed = lead[..., None, None] + (np.arange(now.shape[-2])[:, None] - np.arange(segments))
-    passed[..., :-1] = np.minimum(passed[..., :-1], 1.0)  # the last segment goes on
+    rows = np.arange(now.shape[-2])
+    segments = np.arange(reference.shape[-2] - 1)
+    s = lead[..., None, None] + (rows[:, None] - segments)
+    # The last segment goes on beyond the end of the reference.
+    s[..., :-1] = np.minimum(s[..., :-1], 1.0)
     steps = reference[..., 1:, :] - reference[..., :-1, :]
-    return np.asarray(reference[..., :1, :] + np.maximum(passed, 0.0) @ steps)
+    return np.asarray(reference[..., :1, :] + np.maximum(s, 0.0) @ steps)

@@ -47,28 +47,24 @@ from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
-LEAD_CAP: Final = (
-    100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
-)
-PIECE: Final = (
-    32  # runs side by side whose filters are updated at once; all of them if a single one learns
-)
+# [1] Largest lead of one filter in −2 ln likelihood, so that another can come back after a change.
+LEAD_CAP: Final = 100.0
+# The filters of this number of runs side by side are updated at once, and all of these if a single one learns.
+PIECE: Final = 32
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
-MOVED_FRAMES: Final = (
-    3  # successive frames that do not fit but agree with each other, of a moved camera
-)
-AGREEMENT: Final = (
-    0.25  # [1] of ‖ν‖², below which ‖ν − e‖² says that a frame agrees with the one before
-)
-# [m/rad] prior deviation of an entry of E; per rad of H
+# After this number of successive frames that do not fit but agree with each other, the camera was moved.
+MOVED_FRAMES: Final = 3
+# A frame agrees with the one before if ‖ν − e‖² is below this share of ‖ν‖².
+AGREEMENT: Final = 0.25  # [1]
+# [m/rad] prior deviation of an entry of E; [m/rad/rad] that of H
 DEVIATIONS: Final = np.array([0.01, 0.01, 0.1, 0.4])
 PRIOR: Final = np.array([0.0, 6.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
-MODEL_ERROR: Final = 0.02  # [m/rad] c
-# [1/√rad] of E and H, as a share of their prior deviation
+MODEL_ERROR: Final = 0.02  # [m/rad] c, deviation of the unexplained motion
+# [1/√rad] random walk of an entry of E or H, as a share of its prior deviation
 WALK: Final = np.array([0.0, 0.0, 0.1, 0.1])
-MAP_WALK: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad] of M
-# [1] ς, of an entry of M from the nearest rotation; then any M
+MAP_WALK: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad] random walk of an entry of M
+# [1] ς, deviation of an entry of M from the nearest rotation; filters beyond these have any M
 ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])
 
 
@@ -95,15 +91,17 @@ def fresh_bank(W: FloatArray, variances: FloatArray, frame: FloatArray | float) 
     """
     m, k = W.shape[-2:]
     bank = np.zeros((*W.shape[:-2], m + k + 1, k + 1))
-    bank[..., :m, :k], bank[..., -1, -1] = W, frame
+    bank[..., :m, :k] = W
     bank[..., m:-1, :k] = variances[..., None] * np.eye(k)
+    bank[..., -1, -1] = frame
     return bank
 
 
 def interrupted(bank: FloatArray, frame: FloatArray) -> FloatArray:
     """Return filters without information about the noise of the last frame, σ² (...)."""
     bank = bank.copy()
-    bank[..., -1], bank[..., -1, :] = 0.0, 0.0
+    bank[..., -1] = 0.0
+    bank[..., -1, :] = 0.0
     bank[..., -1, -1] = frame[..., None]
     return bank
 
@@ -128,34 +126,48 @@ def learn(
         walk: variance that the columns of W gain during the motion, (..., N, K−1).
         learns: (..., N or 1), whether W is learned; otherwise it is considered only.
     """
-    m, regressors = feature_step.shape[-1], h
+    m = feature_step.shape[-1]
+    K = h.shape[-1] + 1
+    walked = walk * h
     h = np.concatenate([h, np.full((*h.shape[:-1], 1), -1.0)], axis=-1)
+
+    # One product with h gives W h above P h; less Δy, it is −ν above P h. The change of the bank is minus its products
+    # with the gain.
     known = np.matvec(bank, h)
-    known[..., m:-1] += walk * regressors
+    known[..., m:-1] += walked
     Ph = known[..., m:]
     s = frame[..., None] + model + np.vecdot(h, Ph)
-    # −ν above P h: minus their products with the gain is the change
     known[..., :m] -= feature_step[..., None, :]
     square = np.vecdot(known[..., :m], known[..., :m])
+
     capped = np.maximum(s, square / GATE)
     noise = frame[..., None] + (capped - s)
     share = noise / capped
-    gain = Ph / np.where(learns, capped, np.inf)[..., None]  # its last column is not used
+    # An infinite variance leaves W as it is. The last column, for e, is not used: the column of the new e replaces it.
+    gain = Ph / np.where(learns, capped, np.inf)[..., None]
     frames = 1.0 + np.minimum(bank[..., -1, -1] / frame[..., None], 1.0)
-    learned, noisy = np.empty(bank.shape), -share[..., None] * known
+    noisy = -share[..., None] * known
     noisy[..., -1] = noise * (1.0 - share)
+
+    learned = np.empty(bank.shape)
     for part in _parts(bank):
-        new, some = learned[part], np.logical_or.reduce(learns[part].reshape(-1), axis=-1)
+        new = learned[part]
+        some = np.logical_or.reduce(learns[part].reshape(-1), axis=-1)
         new[...] = branch(some, _corrected, bank[part], known[part], gain[part])
-        diagonal = new.reshape(*new.shape[:-2], -1)[..., m * h.shape[-1] :: h.shape[-1] + 1]
+        # P begins after m rows of K entries, so that its diagonal is every (K+1)-th entry from there.
+        flat = new.reshape(*new.shape[:-2], -1)
+        diagonal = flat[..., m * K :: K + 1]
         diagonal[..., :-1] += walk[part]
-        new[..., -1], new[..., -1, :-1] = noisy[part], noisy[part][..., m:-1]
+        new[..., -1] = noisy[part]
+        new[..., -1, :-1] = noisy[part][..., m:-1]
     return learned, Innovation(-known[..., :m], square, s, capped, frames)
 
 
 def _parts(bank: FloatArray) -> Sequence[Any]:
     """Return indices of `PIECE` runs side by side each."""
-    return [slice(k, k + PIECE) for k in range(0, len(bank), PIECE)] if bank.ndim > 3 else [...]
+    if bank.ndim <= 3:
+        return [...]
+    return [slice(k, k + PIECE) for k in range(0, len(bank), PIECE)]
 
 
 def _corrected(bank: FloatArray, known: FloatArray, gain: FloatArray) -> FloatArray:
@@ -172,15 +184,14 @@ def of_filter(tree: Tree, index: IntArray) -> Tree:
 class RegressionState(NamedTuple):
     """The state of the regression."""
 
-    bank: FloatArray  # of the filters, (..., B, m+K, K)
+    bank: FloatArray  # the filters, (..., B, m+K, K)
     scores: FloatArray  # ℓ_b, (..., B)
     mean: FloatArray  # W̄ with e, (..., m, K)
     share: FloatArray  # Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise
-    rotation: (
-        FloatArray  # R of the filter with the largest weight of those that have one, (..., m, m)
-    )
+    # R of the filter with the largest weight of those that have one, (..., m, m)
+    rotation: FloatArray
     rotations: FloatArray  # R of each filter that has one, (..., R, m, m)
-    excess: FloatArray  # (M − R) (P_MM + ς² I)⁻¹ of each of them; like R it changes with W and P_WW only
+    excess: FloatArray  # (M − R) (P_MM + ς² I)⁻¹ for each of them; like R it changes with W and P_WW only
     streak: IntArray  # number of successive frames that do not fit but agree with each other, (...)
     moves: IntArray  # how often the camera seems to have been moved, (...)
 
@@ -192,36 +203,41 @@ class Regression:
     def __init__(self, knowledge: RobotKnowledge) -> None:
         """Take the sizes, and the working region, whose centre is q_c."""
         spec = knowledge.spec
-        self._m, self._n = m, n = spec.m, spec.n
+        m = spec.m
+        n = spec.n
+        self._m = m
+        self._n = n
         self._pairs = np.triu_indices(n)
         lower, upper = knowledge.region or (spec.joint_lower, spec.joint_upper)
         self._centre: FloatArray = (lower + upper) / 2.0
-        self._map = slice(n + len(self._pairs[0]), n + len(self._pairs[0]) + m)
-        own = np.repeat(DEVIATIONS[:, None] ** 2, self._map.start, axis=1)
-        self._P0 = np.concatenate([own, np.ones((len(DEVIATIONS), m))], axis=1)
-        self._walk = np.concatenate(
-            [WALK[:, None] ** 2 * own, np.repeat(MAP_WALK[:, None] ** 2, m, axis=1)], axis=1
-        )
+
+        # Columns of W: E and H, which are of the arm, and then M.
+        arm = n + len(self._pairs[0])
+        self._map = slice(arm, arm + m)
+        arm_variances = np.repeat(DEVIATIONS[:, None] ** 2, arm, axis=1)
+        map_walks = np.repeat(MAP_WALK[:, None] ** 2, m, axis=1)
+        self._P0 = np.concatenate([arm_variances, np.ones((len(DEVIATIONS), m))], axis=1)
+        self._walk = np.concatenate([WALK[:, None] ** 2 * arm_variances, map_walks], axis=1)
 
     def start(self, lead: tuple[int, ...], frame: float) -> RegressionState:
         """Return the state of the nominal model, for the variance σ² of a frame, m²."""
-        m, none = self._m, np.zeros(lead, dtype=np.int_)
+        m = self._m
         W = np.zeros((m, self._map.stop))
         W[:, self._map] = np.eye(m)
         bank = fresh_bank(np.broadcast_to(W, (len(PRIOR), *W.shape)), self._P0, frame)
+        mean = np.concatenate([W, np.zeros((m, 1))], axis=1)
         near = (*lead, len(ROTATION_DEVIATIONS), m, m)
+        none = np.zeros(lead, dtype=np.int_)[()]
         return RegressionState(
-            np.broadcast_to(bank, (*lead, *bank.shape)),
-            np.broadcast_to(PRIOR, (*lead, len(PRIOR))),
-            np.broadcast_to(
-                np.concatenate([W, np.zeros((m, 1))], axis=1), (*lead, m, self._map.stop + 1)
-            ),
-            np.zeros(lead)[()],
-            np.broadcast_to(np.eye(m), (*lead, m, m)),
-            np.broadcast_to(np.eye(m), near),
-            np.zeros(near),
-            none[()],
-            none[()],
+            bank=np.broadcast_to(bank, (*lead, *bank.shape)),
+            scores=np.broadcast_to(PRIOR, (*lead, len(PRIOR))),
+            mean=np.broadcast_to(mean, (*lead, *mean.shape)),
+            share=np.zeros(lead)[()],
+            rotation=np.broadcast_to(np.eye(m), (*lead, m, m)),
+            rotations=np.broadcast_to(np.eye(m), near),
+            excess=np.zeros(near),
+            streak=none,
+            moves=none,
         )
 
     def interrupt(self, state: RegressionState, frame: FloatArray) -> RegressionState:
@@ -257,19 +273,18 @@ class Regression:
         bank, found = learn(
             state.bank, h[..., None, :], feature_step, frame, model, walk, moved[..., None]
         )
+
         evidence = found.square / found.capped + self._m * np.log(found.capped)
         scores = state.scores + evidence * moved[..., None]
         scores = np.minimum(scores - np.minimum.reduce(scores, axis=-1)[..., None], LEAD_CAP)
         best = scores.argmin(axis=-1)
-        streak = self._streak(
-            state, of_filter(found, best), pick(state.bank[..., : self._m, -1], best)
-        )
-        state, jumped = (
-            state._replace(bank=bank, scores=scores, streak=streak),
-            streak >= MOVED_FRAMES,
-        )
+        last_noise = pick(state.bank[..., : self._m, -1], best)
+        streak = self._streak(state, of_filter(found, best), last_noise)
+        state = state._replace(bank=bank, scores=scores, streak=streak)
+        jumped = streak >= MOVED_FRAMES
         state = branch(jumped, self._forget, state, frame)
-        before = state.rotations, state.excess
+
+        before = (state.rotations, state.excess)
         columns = state.bank[..., : len(ROTATION_DEVIATIONS), :, self._map]
         rotations, excess = branch(moved | jumped, self._nearest, before, columns)
         state = state._replace(rotations=rotations, excess=excess)
@@ -280,9 +295,11 @@ class Regression:
         self, state: RegressionState, joint_position: FloatArray, nominal: FloatArray
     ) -> FloatArray:
         """Return Ĵ, (..., m, n), at `joint_position` (..., n), rad, for J_n (..., m, n) there."""
-        n, W = self._n, state.mean
-        H = W[..., n : self._map.start] @ self._quadratic(joint_position)
-        return np.asarray(W[..., self._map] @ nominal + W[..., :n] + H)
+        W = state.mean
+        M = W[..., self._map]
+        E = W[..., : self._n]
+        H = W[..., self._n : self._map.start]
+        return np.asarray(M @ nominal + E + H @ self._quadratic(joint_position))
 
     def regressors(
         self, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
@@ -294,9 +311,8 @@ class Regression:
             joint_step: Δq, (..., n), rad.
             predicted: J_n Δq, (..., m), m.
         """
-        return np.concatenate(
-            [joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1
-        )
+        quadratic = np.matvec(self._quadratic(middle), joint_step)
+        return np.concatenate([joint_step, quadratic, predicted], axis=-1)
 
     def explained(self, state: RegressionState, h: FloatArray) -> FloatArray:
         """Return the motion Ĵ Δq, (..., m), of a joint motion with the regressors h."""
@@ -314,7 +330,8 @@ class Regression:
     def _quadratic(self, joint_position: FloatArray) -> FloatArray:
         """Return the derivatives of the products r_j r_k (j < k) and r_j²/2, (..., n (n+1)/2, n), at r = q − q_c."""
         first, second = self._pairs
-        r, rows = joint_position - self._centre, np.arange(len(first))
+        r = joint_position - self._centre
+        rows = np.arange(len(first))
         derivative = np.zeros((*r.shape[:-1], len(first), self._n))
         derivative[..., rows, first] = r[..., second]
         derivative[..., rows, second] = r[..., first]
@@ -323,11 +340,14 @@ class Regression:
     def _streak(self, state: RegressionState, found: Innovation, last: FloatArray) -> IntArray:
         """Return `streak` after a motion `found` by the filter with the largest weight; `last` is its e before."""
         fits = found.square <= GATE * found.variance
-        alone = found.nu - last  # ν without the noise of the last frame
-        agrees = (np.vecdot(alone, alone) < AGREEMENT * found.square) | (state.streak == 0)
-        return np.asarray(np.where(fits, 0, np.where(agrees, state.streak + 1, 1)))
+        # Where a frame agrees with the one before, the noise of the last frame, e, explains its innovation.
+        alone = found.nu - last
+        agrees = np.vecdot(alone, alone) < AGREEMENT * found.square
+        goes_on = agrees | (state.streak == 0)
+        return np.asarray(np.where(fits, 0, np.where(goes_on, state.streak + 1, 1)))
 
     def _forget(self, state: RegressionState, frame: FloatArray) -> RegressionState:
+        """Return the state in which W has its prior variances again."""
         bank = fresh_bank(state.bank[..., : self._m, :-1], self._P0, frame[..., None])
         return state._replace(bank=bank, streak=np.zeros_like(state.streak), moves=state.moves + 1)
 
@@ -343,18 +363,23 @@ class Regression:
 
         so that directions count by their certainty: two known directions of three give the third.
         """
-        m, weights, R = self._m, self.weights(state)[..., None, None], state.rotations
+        m = self._m
         near = len(ROTATION_DEVIATIONS)
-        W, P_M = state.bank[..., :m, :], state.bank[..., :near, m:, :][..., self._map, :]
-        W = np.concatenate([W[..., :near, :, :] - state.excess @ P_M, W[..., near:, :, :]], axis=-3)
-        mean = np.add.reduce(weights * W, axis=-3)
-        share = np.add.reduce(weights[..., 0, 0] * noise, axis=-1)
-        return state._replace(mean=mean, share=share, rotation=pick(R, np.minimum(best, near - 1)))
+        W = state.bank[..., :m, :]
+        P_M = state.bank[..., :near, m:, :][..., self._map, :]
+        completed = W[..., :near, :, :] - state.excess @ P_M
+        W = np.concatenate([completed, W[..., near:, :, :]], axis=-3)
+        weights = self.weights(state)
+        mean = np.add.reduce(weights[..., None, None] * W, axis=-3)
+        share = np.add.reduce(weights * noise, axis=-1)
+        rotation = pick(state.rotations, np.minimum(best, near - 1))
+        return state._replace(mean=mean, share=share, rotation=rotation)
 
     def _nearest(self, _: Any, columns: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ANN401 - those before
         """Return `rotations` and `excess` of the state for the columns of M of filters, (..., R, m+K, m)."""
         m = self._m
-        M, P = columns[..., :m, :], columns[..., m:, :][..., self._map, :]
+        M = columns[..., :m, :]
+        P = columns[..., m:, :][..., self._map, :]
         believed = P + (ROTATION_DEVIATIONS**2)[:, None, None] * np.eye(m)
         try:
             information = np.linalg.inv(believed)
