@@ -35,11 +35,11 @@ from servobench.plant.robot.camera_file import OwnCamera, turning_point
 from servobench.plant.robot.hand_eye import rotation_matrix, turn_about
 from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.workspace import camera_pose
+from servobench.plant.robot.workspace import Workspace, camera_pose
 
 SIDE: Final = radians(60.0)  # angle of the second fixed camera's optical axis from the vertical
 HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
-MAX_SIZE: Final = 0.6  # usual share of the image's height that a ball takes
+MAX_BALL_SHARE: Final = 0.6  # [1] usual largest share of the image's height that a ball takes
 BASELINE: Final = 0.2  # [m] between two cameras on the hand; for a UR5
 OPTICAL = ("focal", "centre", "distortion")  # axes of a mismatch that a camera in pixels has
 ON_HAND = "mount"  # the axis that a camera on the hand has
@@ -71,27 +71,37 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
         return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, (count, *shape))
 
     mount = named_generator(seed, "mismatch.mount_axis").standard_normal((count, 3))
-    mount *= size(ON_HAND) * draw(ON_HAND, 1) / np.linalg.norm(mount, axis=-1, keepdims=True)
+    length = np.linalg.norm(mount, axis=-1, keepdims=True)
+    mount *= size(ON_HAND) * draw(ON_HAND, 1) / length
+    further_turns = [_draw_turn(mismatch, camera, seed) for camera in range(1, count)]
     return CameraDraws(
         focal=1.0 + size("focal") * draw("focal"),
         centre=size("centre") * draw("centre", 2),
         distortion=size("distortion") * draw("distortion"),
-        turn=np.array([np.zeros(3), *(_draw_turn(mismatch, i, seed) for i in range(1, count))]),
+        turn=np.array([np.zeros(3), *further_turns]),
         mount=mount,
+    )
+
+
+def _no_draws(count: int) -> CameraDraws:
+    """Return the values of `count` cameras that are as planned."""
+    return CameraDraws(
+        focal=np.ones(count),
+        centre=np.zeros((count, 2)),
+        distortion=np.zeros(count),
+        turn=np.zeros((count, 3)),
+        mount=np.zeros((count, 3)),
     )
 
 
 def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
     """Return the rotation vector, (3,) rad, of a further camera, drawn as for the first one."""
     angle = mismatch.size("camera_rotation")
-    axis = draw_camera_axis(
-        angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}")
-    )
-    share = (
-        1.0
-        if mismatch.camera_exact
-        else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
-    )
+    axis_generator = named_generator(seed, f"mismatch.camera_axis_{camera}")
+    axis = draw_camera_axis(angle, MAX_TILT, axis_generator)
+    share = 1.0
+    if not mismatch.camera_exact:
+        share = named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
     return np.asarray(share * angle * axis)
 
 
@@ -107,47 +117,57 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
         raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
     if robot.camera is not None:
         _check_fit(robot.camera, setup, mount)
-    c = setup.cameras
-    draws = CameraDraws(
-        np.ones(c), np.zeros((c, 2)), np.zeros(c), np.zeros((c, 3)), np.zeros((c, 3))
-    )
-    model = _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), draws)
-    home = robot.workspace.home
-    if robot.camera is not None and not (
-        model.distance > NEAR and model.valid_at(model.points(home)).all()
-    ):
-        where = [
-            [round(value, 3) for value in point]
-            for point in model.point_motions(home)[0][0].tolist()
-        ]
-        raise ValueError(
-            f"camera {robot.camera.name} does not see the target with the arm at home: the target is at "
-            f"{where} m in the camera's frame (x right, y down, z ahead); wanted another pose, mount or target"
-        )
-    if robot.camera is not None and (radius := robot.camera.keys.target.radius) is not None:
-        size, height = 2.0 * robot.pinhole.focal * radius / model.distance, robot.pinhole.height
-        if size > MAX_SIZE * height:
-            remark(
-                f"{robot.camera.name}: the ball takes {size:.0f} px of an image {height} px high; is it its radius?"
-            )
+    cameras = planned_cameras(setup, mount, robot)
+    model = _model(setup, mount, robot, robot.arm, cameras, _no_draws(setup.cameras))
+    if robot.camera is not None:
+        _check_target(robot.camera, model, robot.workspace.home)
     return model
 
 
 def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
     """Refuse a user's camera that cannot be that of a set-up."""
     name = camera.name
-    on, off = ("flange", "base") if mount == "hand" else ("base", "flange")
+    on, off = "base", "flange"
+    other = f"{setup.name}:hand"
+    if mount == "hand":
+        on, off = "flange", "base"
+        other = setup.name
     if camera.keys.pose.frame == off:
-        other = setup.name if mount == "hand" else f"{setup.name}:hand"
         raise ValueError(f"camera {name} is on the {off}; use the sensing {other}")
     if camera.keys.target.frame == on:
         raise ValueError(
             f"camera {name}: the target must be on the {off} where the camera is on the {on}"
         )
-    if (camera.second is None) != (setup.cameras == 1):
+    described = len(camera.pair)
+    if (described == 1) != (setup.cameras == 1):
         raise ValueError(
-            f"sensing {setup.name} has {setup.cameras} cameras, and {name} describes {2 - (camera.second is None)}; "
+            f"sensing {setup.name} has {setup.cameras} cameras, and {name} describes {described}; "
             'name the file of the other one, second = "FILE", where there are two'
+        )
+
+
+def _check_target(camera: OwnCamera, model: SetupModel, home: FloatArray) -> None:
+    """Refuse a user's camera that does not see the target with the arm at home; remark on a ball that fills the image.
+
+    Raises:
+        ValueError: the target is behind the camera or beside its image.
+    """
+    ahead = model.distance > NEAR
+    if not (ahead and model.valid_at(model.points(home)).all()):
+        points, _ = model.point_motions(home)
+        where = [[round(value, 3) for value in point] for point in points[0].tolist()]
+        raise ValueError(
+            f"camera {camera.name} does not see the target with the arm at home: the target is at "
+            f"{where} m in the camera's frame (x right, y down, z ahead); wanted another pose, mount or target"
+        )
+    radius = camera.keys.target.radius
+    if radius is None:
+        return
+    height = camera.pinhole.height
+    size = 2.0 * camera.pinhole.focal * radius / model.distance
+    if size > MAX_BALL_SHARE * height:
+        remark(
+            f"{camera.name}: the ball takes {size:.0f} px of an image {height} px high; is it its radius?"
         )
 
 
@@ -163,11 +183,11 @@ def true_model(
 
     Args:
         setup: the set-up.
-        mount: of its cameras.
+        mount: where its cameras are mounted.
         robot: the nominal one.
         arm: the true one.
         turn: (3,), rotation vector of the first camera [rad].
-        draws: of all cameras.
+        draws: the values drawn for all cameras.
 
     Raises:
         ValueError: see `nominal_model`.
@@ -175,10 +195,13 @@ def true_model(
     nominal = nominal_model(setup, mount, robot)
     turns = [turn, *draws.turn[1:]]
     pivot = nominal.pivot(robot.workspace.centre)
-    cameras = np.stack(
-        [turn_about(pose, each, pivot) for pose, each in zip(nominal.cameras, turns, strict=True)]
-    )
+    turned = [
+        turn_about(pose, rotation, pivot)
+        for pose, rotation in zip(nominal.cameras, turns, strict=True)
+    ]
+    cameras = np.stack(turned)
     if mount == "hand":
+        # R_FC ← R_FC R(mount): the camera turns about its own centre, which moves with the tool.
         cameras[:, :3, :3] @= rotation_matrix(draws.mount)
         cameras[:, :3, 3] += arm.tool - robot.arm.tool
     return _model(setup, mount, robot, arm, cameras, draws)
@@ -194,28 +217,36 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
         raise ValueError(
             f"{setup.name} needs {setup.cameras} cameras, and there are places for one or two"
         )
-    work, own = robot.workspace, robot.camera
+    own = robot.camera
     if own is not None and own.keys.pose.frame:
-        return np.stack(
-            [
-                each.keys.pose.matrix
-                for each in (own, own.second)[: setup.cameras]
-                if each is not None
-            ]
-        )
+        described = own.pair[: setup.cameras]
+        return np.stack([camera.keys.pose.matrix for camera in described])
     if mount == "fixed":
-        above, distance = work.camera_pose()[:3, :3], setup.closeness * work.camera_distance
-        front = rotation_matrix([0.0, SIDE, 0.0]) @ above
-        return np.stack(
-            [camera_pose(R, work.centre, distance) for R in (above, front)[: setup.cameras]]
-        )
+        return _planned_fixed_cameras(setup, robot.workspace)
+    return _planned_hand_cameras(setup, robot)
+
+
+def _planned_fixed_cameras(setup: SensingSetup, work: Workspace) -> FloatArray:
+    """Return the poses of one or two cameras beside the arm, (c, 4, 4), in the base frame."""
+    distance = setup.closeness * work.camera_distance
+    above = work.camera_pose()[:3, :3]
+    front = rotation_matrix([0.0, SIDE, 0.0]) @ above
+    rotations = (above, front)[: setup.cameras]
+    return np.stack([camera_pose(R, work.centre, distance) for R in rotations])
+
+
+def _planned_hand_cameras(setup: SensingSetup, robot: Robot) -> FloatArray:
+    """Return the poses of one or two cameras on the hand, (c, 4, 4), in the flange frame."""
     poses = np.stack([np.eye(4)] * setup.cameras)
     poses[:, :3, 3] = robot.arm.tool
     if setup.cameras == 2:
-        half, distance = 0.5 * BASELINE * work.scale, HAND_DISTANCE * work.scale
+        half = 0.5 * BASELINE * robot.workspace.scale
+        distance = HAND_DISTANCE * robot.workspace.scale
         for pose, side in zip(poses, (-1.0, 1.0), strict=True):
+            # A turn about y directs each camera at the common point ahead.
             angle = -side * atan2(half, distance)
-            pose[:3, 0], pose[:3, 2] = (cos(angle), 0.0, -sin(angle)), (sin(angle), 0.0, cos(angle))
+            pose[:3, 0] = (cos(angle), 0.0, -sin(angle))
+            pose[:3, 2] = (sin(angle), 0.0, cos(angle))
             pose[:3, 3] += (side * half, 0.0, 0.0)
     return poses
 
@@ -228,56 +259,97 @@ def _model(
     cameras: FloatArray,
     draws: CameraDraws,
 ) -> SetupModel:
-    work, own = robot.workspace, robot.camera
-    home, far = robot.arm.frames(work.home)[-1], work.camera_distance
-    points = np.array(setup.target)
-    side = None if own is None else own.keys.target.side
-    # About its middle
-    shape = work.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))
+    """Return an arm with cameras at given poses, (c, 4, 4), and the target in front of them."""
     if mount == "fixed":
-        distance = setup.closeness * far
-        if own is not None:
-            distance = float((work.centre - robot.camera_pose[:3, 3]) @ robot.camera_pose[:3, 2])
-        target = arm.tool + shape @ (home[:3, :3].T @ robot.camera_pose[:3, :3]).T
+        target, distance = _target_on_flange(setup, robot, arm)
     else:
-        distance = HAND_DISTANCE * work.scale
-        ahead = robot.arm.tool + np.array([0.0, 0.0, distance])
-        if own is not None:
-            pose = planned_cameras(setup, mount, robot)[0]
-            shape, ahead = shape @ pose[:3, :3].T, pose[:3, 3] + distance * pose[:3, 2]
-            if own.keys.target.frame:
-                ahead = (np.array(own.keys.target.position) - home[:3, 3]) @ home[:3, :3]
-                distance = float((ahead - pose[:3, 3]) @ pose[:3, 2])
-        target = (shape + ahead) @ home[:3, :3].T + home[:3, 3]
+        target, distance = _target_in_world(setup, robot)
     return SetupModel(
-        arm,
-        setup,
-        mount,
-        cameras,
-        _optics(setup, robot, draws),
-        target,
-        distance,
-        robot.pinhole,
-        far,
+        arm=arm,
+        setup=setup,
+        mount=mount,
+        cameras=cameras,
+        optics=_optics(setup, robot, draws),
+        target=target,
+        distance=distance,
+        planned=robot.pinhole,
+        far=robot.workspace.camera_distance,
     )
+
+
+def _target_shape(setup: SensingSetup, robot: Robot) -> FloatArray:
+    """Return the points of the target about its middle, (p, 3) m, in a frame that faces the first camera."""
+    points = np.array(setup.target)
+    own = robot.camera
+    if own is None or own.keys.target.side is None:
+        return robot.workspace.scale * points
+    return np.asarray(points * (own.keys.target.side / max(np.ptp(points), 1e-9)))
+
+
+def _target_on_flange(
+    setup: SensingSetup, robot: Robot, arm: SerialArm
+) -> tuple[FloatArray, float]:
+    """Return a target in place of the ball, (p, 3) m in the flange frame, and its distance from fixed cameras [m]."""
+    work = robot.workspace
+    distance = setup.closeness * work.camera_distance
+    X_BC = robot.camera_pose
+    if robot.camera is not None:
+        distance = float((work.centre - X_BC[:3, 3]) @ X_BC[:3, 2])
+    # R_FC with the arm at home, at which a plate faces the first camera
+    R_BF = robot.arm.frames(work.home)[-1, :3, :3]
+    R_FC = R_BF.T @ X_BC[:3, :3]
+    target = arm.tool + _target_shape(setup, robot) @ R_FC.T
+    return target, distance
+
+
+def _target_in_world(setup: SensingSetup, robot: Robot) -> tuple[FloatArray, float]:
+    """Return a target ahead of the hand at home, (p, 3) m in the base frame, and its distance from the camera [m]."""
+    own = robot.camera
+    X_BF = robot.arm.frames(robot.workspace.home)[-1]
+    distance = HAND_DISTANCE * robot.workspace.scale
+    shape = _target_shape(setup, robot)
+    middle = robot.arm.tool + np.array([0.0, 0.0, distance])  # in the flange frame
+    if own is not None:
+        X_FC = planned_cameras(setup, "hand", robot)[0]
+        shape = shape @ X_FC[:3, :3].T
+        middle = X_FC[:3, 3] + distance * X_FC[:3, 2]
+        if own.keys.target.frame:
+            middle = (np.array(own.keys.target.position) - X_BF[:3, 3]) @ X_BF[:3, :3]
+            distance = float((middle - X_FC[:3, 3]) @ X_FC[:3, 2])
+    target = (shape + middle) @ X_BF[:3, :3].T + X_BF[:3, 3]
+    return target, distance
 
 
 def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:
     """Return the intrinsics of the cameras as drawn; those of depth are rectified."""
-    optics = ideal_optics(robot.pinhole, setup.cameras)
-    focal, centre, distortion, further = optics.focal, optics.centre, draws.distortion, None
+    planned = ideal_optics(robot.pinhole, setup.cameras)
+    focal = planned.focal
+    centre = planned.centre
+    distortion = draws.distortion
+    further = None
     if robot.camera is not None and setup.unit == "px":
-        own = [each for each in (robot.camera, robot.camera.second) if each is not None]
+        own = robot.camera.pair
         K = np.array([each.matrix for each in own])
-        focal, centre = K[:, 0, 0], K[:, :2, 2]
+        focal = K[:, 0, 0]
+        centre = K[:, :2, 2]
         distortion = np.array([each.distortion[0] for each in own]) + draws.distortion
         further = _further(own, distortion)
-        if (
-            further.shape[1] == COLUMNS["plumb_bob"]
-            and (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all()
-        ):
+        if _is_plain(further):
             further = None
-    return Optics(focal * draws.focal, centre + draws.centre, distortion, optics.size, further)
+    return Optics(
+        focal=focal * draws.focal,
+        centre=centre + draws.centre,
+        distortion=distortion,
+        size=planned.size,
+        further=further,
+    )
+
+
+def _is_plain(further: FloatArray) -> bool:
+    """Return whether further numbers of cameras, (c, k), are those of square pixels and of k₁ alone."""
+    if further.shape[1] != COLUMNS["plumb_bob"]:
+        return False
+    return bool((further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all())
 
 
 def _further(own: Sequence[OwnCamera], distortion: FloatArray) -> FloatArray:
@@ -288,9 +360,11 @@ def _further(own: Sequence[OwnCamera], distortion: FloatArray) -> FloatArray:
         _, *others = camera.distortion
         if camera.lens == "equidistant":
             k2, k3, k4 = others
-            row[:5] = 1.0, k2, 0.0, 0.0, k3
+            row[1] = k2
+            row[4] = k3
             row[6] = k4
         else:
+            # k₂, p₁, p₂, k₃, and behind the largest r² the rational model's k₄, k₅, k₆
             row[1:5] = others[:4]
             row[6 : 2 + len(others)] = others[4:]
         row[0] = camera.matrix[1, 1] / camera.matrix[0, 0]

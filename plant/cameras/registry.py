@@ -44,17 +44,32 @@ class Sensing:
         if mount not in (FIXED, HAND):
             name, mount = word.strip(), FIXED
         if name not in setups:
-            known = [*setups, *(f"{key}:{HAND}" for key in setups)]
+            on_hand = [f"{key}:{HAND}" for key in setups]
+            known = [*setups, *on_hand]
             raise ValueError(f"unknown sensing {word!r}: {suggest(word, known)}")
         return cls(setups[name], HAND if mount == HAND else FIXED)
 
     def __str__(self) -> str:
         """Return the word, as it stands in the column `sensing`; fixed cameras are not named."""
-        return self.setup.name if self.mount == FIXED else f"{self.setup.name}:{self.mount}"
+        if self.mount == FIXED:
+            return self.setup.name
+        return f"{self.setup.name}:{self.mount}"
 
     def _is_plain(self, robot: Robot) -> bool:
         """Return whether it is the ball in 3-D by the bench's fixed camera, for which the arm's own model serves."""
         return self == Sensing() and robot.camera is None
+
+    def _check_axes(self, mismatch: Mismatch) -> None:
+        """Refuse a mismatch with an axis that the cameras do not have."""
+        for axis, _ in mismatch.axes:
+            if axis in OPTICAL and self.setup.name == POSITION.name:
+                raise ValueError(
+                    f"mismatch axis {axis} needs a camera that sees pixels, such as the sensing pixel"
+                )
+            if axis == ON_HAND and self.mount != HAND:
+                raise ValueError(
+                    f"mismatch axis {axis} needs a camera on the hand, such as the sensing pixel:{HAND}"
+                )
 
     def nominal(self, robot: Robot) -> RobotModel:
         """Return the nominal robot under this sensing, as planned, which controllers may know.
@@ -62,9 +77,9 @@ class Sensing:
         Raises:
             ValueError: the arm has too few joints for the set-up.
         """
-        return (
-            robot.nominal if self._is_plain(robot) else nominal_model(self.setup, self.mount, robot)
-        )
+        if self._is_plain(robot):
+            return robot.nominal
+        return nominal_model(self.setup, self.mount, robot)
 
     def true(
         self,
@@ -80,23 +95,16 @@ class Sensing:
             robot: the nominal one.
             true: the true arm and the ball's fixed camera.
             sample: how they differ from the nominal ones.
-            mismatch: of which they are drawn.
-            seed: of the same draw.
+            mismatch: the deviations of which they are drawn.
+            seed: the seed of the same draw.
 
         Raises:
             ValueError: the arm has too few joints, or the mismatch names an axis that the cameras do not have.
         """
-        for axis, _ in mismatch.axes:
-            if axis in OPTICAL and self.setup.name == POSITION.name:
-                raise ValueError(
-                    f"mismatch axis {axis} needs a camera that sees pixels, such as the sensing pixel"
-                )
-            if axis == ON_HAND and self.mount != HAND:
-                raise ValueError(
-                    f"mismatch axis {axis} needs a camera on the hand, such as the sensing pixel:{HAND}"
-                )
+        self._check_axes(mismatch)
         if self._is_plain(robot):
             return true, None
         draws = draw_cameras(mismatch, self.setup.cameras, seed)
         turn = sample.camera_angle * sample.camera_axis
-        return true_model(self.setup, self.mount, robot, true.arm, turn, draws), draws
+        model = true_model(self.setup, self.mount, robot, true.arm, turn, draws)
+        return model, draws

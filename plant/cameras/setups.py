@@ -44,13 +44,13 @@ Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 """Points (..., c, p, 3) [m] in the frame of each camera, and the optics -> features (..., m)."""
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
-DIFFERENCE: Final = 1e-6  # share of the motions over which features are differentiated
-CHECKED: Final = 1e-3  # the same for a `measure` in single precision, and where `rates` are checked
-FLOATS: Final = (np.float64, np.float32)  # that `measure` and `rates` may return
-POSES: Final = 5  # of the target, at which the functions of a user's set-up are checked
-RATE_TOLERANCE: Final = (
-    1e-3  # [1] of the fastest rate, by which `rates` may differ from the derivative
-)
+FINE_STEP: Final = 1e-6  # [1] share of the motions over which features are differentiated
+# The same for a `measure` in single precision, and where `rates` are checked
+COARSE_STEP: Final = 1e-3  # [1]
+FLOAT_TYPES: Final = (np.float64, np.float32)  # types that `measure` and `rates` may return
+CHECK_POSES: Final = 5  # poses of the target at which the functions of a user's set-up are checked
+# Share of the fastest rate by which `rates` may differ from the derivative
+RATE_TOLERANCE: Final = 1e-3  # [1]
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,12 @@ class SensingSetup:
             raise ValueError(
                 f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}"
             )
-        if self.single and self.m % (count := self.cameras * len(self.target)):
+        count = self.cameras * len(self.target)
+        if self.single and self.m % count:
             raise ValueError(
                 f"sensing {self.name}: single needs as many features for each of {count} points, got {self.m}"
             )
+        # The channel checks names, scale and tolerance, for any focal length and distance.
         self.channel(500.0, 1.0)
 
     @property
@@ -123,7 +125,9 @@ class SensingSetup:
         """Return the natural size of a feature, in its unit, for a focal length [px] and a `distance` [m]."""
         if self.scale is not None:
             return self.scale(focal, distance)
-        return focal / distance if self.unit == "px" else 1.0 / LENGTH[self.unit]
+        if self.unit == "px":
+            return focal / distance
+        return 1.0 / LENGTH[self.unit]
 
     def change(self, points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
         """Return how features of points (..., c, p, 3) change, (..., m, n), with motions (..., c, p, 3, n) [m]."""
@@ -134,31 +138,35 @@ class SensingSetup:
     def _differences(
         self, points: FloatArray, motions: FloatArray, optics: Optics, h: float
     ) -> FloatArray:
+        """Return `change` by central differences over a share h of the motions."""
         step = h * np.moveaxis(motions, -1, 0)
-        there, back = self.measure(points + step, optics), self.measure(points - step, optics)
-        return np.ascontiguousarray(np.moveaxis((there - back) / (2.0 * h), 0, -1))
+        ahead = self.measure(points + step, optics)
+        behind = self.measure(points - step, optics)
+        rates = (ahead - behind) / (2.0 * h)
+        return np.ascontiguousarray(np.moveaxis(rates, 0, -1))
 
     @cached_property
     def _step(self) -> float:
         """Share of the motions for `_differences`, by whether `measure` tells apart motions that are far smaller."""
-        fine, coarse = (
-            self._differences(*self._places(), h) for h in (RATE_TOLERANCE * DIFFERENCE, CHECKED)
-        )
-        lost = np.abs(coarse)[fine == 0.0] > RATE_TOLERANCE * np.median(np.abs(coarse))
-        return CHECKED if lost.any() else DIFFERENCE
+        fine = self._differences(*self._check_poses(), RATE_TOLERANCE * FINE_STEP)
+        coarse = self._differences(*self._check_poses(), COARSE_STEP)
+        rates = np.abs(coarse)
+        lost = rates[fine == 0.0] > RATE_TOLERANCE * np.median(rates)
+        return COARSE_STEP if lost.any() else FINE_STEP
 
-    def _places(self) -> tuple[FloatArray, FloatArray, Optics]:
-        """Return a few places of the target in front of the cameras, two motions of it, and the optics; see `rates`."""
+    def _check_poses(self) -> tuple[FloatArray, FloatArray, Optics]:
+        """Return a few poses of the target in front of the cameras, two motions of it, and the optics; see `rates`."""
         draw = np.random.default_rng(0).uniform
-        beside = np.array([0.0, 0.0, 1.0]) - np.arange(self.cameras)[:, None, None] * [
-            0.1,
-            0.0,
-            0.0,
-        ]
-        points = np.array(self.target) + beside + draw(-0.05, 0.05, (POSES, 1, 1, 3))
-        moved, turned = draw(-1.0, 1.0, (2, POSES, 1, 1, 3, 2))  # of a rigid target
-        motions = moved + np.cross(turned, np.array(self.target)[..., None], axis=-2)
-        return points, np.zeros((*points.shape, 2)) + motions, ideal_optics(CAMERA, self.cameras)
+        target = np.array(self.target)
+        # A metre ahead of the cameras, which are 0.1 m apart
+        side = np.arange(self.cameras)[:, None, None] * [0.1, 0.0, 0.0]
+        ahead = np.array([0.0, 0.0, 1.0]) - side
+        points = target + ahead + draw(-0.05, 0.05, (CHECK_POSES, 1, 1, 3))
+        # The motions of a rigid target: v + ω × t
+        velocity, turn = draw(-1.0, 1.0, (2, CHECK_POSES, 1, 1, 3, 2))
+        rigid = velocity + np.cross(turn, target[..., None], axis=-2)
+        motions = np.zeros((*points.shape, 2)) + rigid
+        return points, motions, ideal_optics(CAMERA, self.cameras)
 
     @np.errstate(divide="raise", over="raise", invalid="raise")
     def check(self) -> None:
@@ -169,21 +177,28 @@ class SensingSetup:
                 `rates` is not its derivative.
             FloatingPointError: they divide by zero, or the like.
         """
-        points, motions, optics = self._places()
-        given = points.copy(), motions.copy()
-        self._check_array("measure", self.measure(points[0].copy(), optics), (self.m,), points[0])
-        self._check_array("measure", self.measure(given[0], optics), (POSES, self.m), points)
-        rates = self.change(*given, optics)
-        self._check_array("rates", rates, (POSES, self.m, 2), points)
-        if not (np.array_equal(given[0], points) and np.array_equal(given[1], motions)):
+        points, motions, optics = self._check_poses()
+        given_points = points.copy()
+        given_motions = motions.copy()
+        single = self.measure(points[0].copy(), optics)
+        self._check_array("measure", single, (self.m,), points[0])
+        several = self.measure(given_points, optics)
+        self._check_array("measure", several, (CHECK_POSES, self.m), points)
+        rates = self.change(given_points, given_motions, optics)
+        self._check_array("rates", rates, (CHECK_POSES, self.m, 2), points)
+        same_points = np.array_equal(given_points, points)
+        if not (same_points and np.array_equal(given_motions, motions)):
             wanted = "must not change their arguments; work on a copy, such as points.copy()"
             raise ConfigurationError(f"sensing {self.name}: measure and rates {wanted}")
-        differences = self._differences(points, motions, optics, CHECKED)
+        differences = self._differences(points, motions, optics, COARSE_STEP)
+        if self.rates is not None:
+            self._check_rates(rates, differences)
+
+    def _check_rates(self, rates: FloatArray, differences: FloatArray) -> None:
+        """Refuse `rates` that differ from the differences of `measure`, both (k, m, 2)."""
         wrong = np.abs(rates - differences).max(axis=(0, 2))
-        if (
-            self.rates is not None
-            and not (wrong <= RATE_TOLERANCE * np.abs(differences).max()).all()
-        ):
+        bound = RATE_TOLERANCE * np.abs(differences).max()
+        if not (wrong <= bound).all():
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"
@@ -193,16 +208,12 @@ class SensingSetup:
         self, name: str, made: object, shape: tuple[int, ...], points: FloatArray
     ) -> None:
         """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
-        if type(made) is not np.ndarray or made.shape != shape or made.dtype not in FLOATS:
-            came = (
-                f"{made.dtype} of shape {made.shape}"
-                if type(made) is np.ndarray
-                else type(made).__name__
-            )
-            wanted = f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :]"
-            raise ConfigurationError(
-                f"sensing {self.name}: {name} must return {wanted}, got {came}"
-            )
+        wanted = f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :]"
+        expected = f"sensing {self.name}: {name} must return {wanted}"
+        if type(made) is not np.ndarray:
+            raise ConfigurationError(f"{expected}, got {type(made).__name__}")
+        if made.shape != shape or made.dtype not in FLOAT_TYPES:
+            raise ConfigurationError(f"{expected}, got {made.dtype} of shape {made.shape}")
         if not np.isfinite(made).all():
             raise ConfigurationError(
                 f"sensing {self.name}: {name} must return finite numbers, got {made.tolist()}"
@@ -210,11 +221,13 @@ class SensingSetup:
 
     def valid(self, found: BoolArray) -> BoolArray:
         """Return which features are measured, (..., m), where the points (..., c, p) are found or not."""
-        lead, count = found.shape[:-2], found.shape[-2] * found.shape[-1]
         if self.single:
-            return np.repeat(found.reshape(*lead, count), self.m // count, axis=-1)
-        whole = np.logical_and.reduce(found, axis=(-2, -1), keepdims=True)[..., 0]
-        return np.repeat(whole, self.m, axis=-1)
+            *lead, cameras, points = found.shape
+            count = cameras * points
+            each = found.reshape(*lead, count)
+            return np.repeat(each, self.m // count, axis=-1)
+        all_found = np.logical_and.reduce(found, axis=(-2, -1), keepdims=True)[..., 0]
+        return np.repeat(all_found, self.m, axis=-1)
 
 
 def pixels(points: FloatArray, optics: Optics) -> FloatArray:
@@ -244,32 +257,40 @@ def position_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> F
 in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, single=True)
 """Make a set-up of points in images, the features of which are `pixels`."""
 
-HALF: Final = 0.12  # [m] half side of the plate's square, at the corners of which the discs are
+# Half side of the plate's square, at the corners of which the discs are
+HALF_SIDE: Final = 0.12  # [m]
 
 POSITION = SensingSetup(
-    "position",
-    "the ball in 3-D, by a camera with depth",
-    ("x", "y", "z"),
-    "m",
-    position,
-    position_rates,
+    name="position",
+    summary="the ball in 3-D, by a camera with depth",
+    features=("x", "y", "z"),
+    unit="m",
+    measure=position,
+    rates=position_rates,
 )
 PIXEL = in_pixels("pixel", "the ball in the image of one camera", ("u", "v"))
 STEREO = in_pixels(
     "stereo",
     "the ball in the images of two cameras",
     ("u1", "v1", "u2", "v2"),
-    tolerance=math.sqrt(2.0) * SETTLING_BAND,  # both cameras measure a motion across both
+    # Both cameras measure a motion across both.
+    tolerance=math.sqrt(2.0) * SETTLING_BAND,
     cameras=2,
 )
 PLATE = in_pixels(
     "plate",
     "four discs on a plate, for position and orientation",
     ("u1", "v1", "u2", "v2", "u3", "v3", "u4", "v4"),
-    tolerance=2.0
-    * SETTLING_BAND,  # four discs measure a motion of the plate, as long as it does not turn
-    target=((-HALF, -HALF, 0.0), (HALF, -HALF, 0.0), (HALF, HALF, 0.0), (-HALF, HALF, 0.0)),
-    closeness=0.5,  # the orientation of a plate that is small in the image is measured badly
+    # Four discs measure a motion of the plate, as long as it does not turn.
+    tolerance=2.0 * SETTLING_BAND,
+    target=(
+        (-HALF_SIDE, -HALF_SIDE, 0.0),
+        (HALF_SIDE, -HALF_SIDE, 0.0),
+        (HALF_SIDE, HALF_SIDE, 0.0),
+        (-HALF_SIDE, HALF_SIDE, 0.0),
+    ),
+    # The orientation of a plate that is small in the image is measured badly.
+    closeness=0.5,
     least_joints=6,
     judges_pose=True,
 )
@@ -287,12 +308,10 @@ class SetupModel(RobotModel):
 
     arm: SerialArm  # the arm
     setup: SensingSetup  # the set-up
-    mount: Mount  # of the cameras
-    cameras: (
-        FloatArray  # (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
-    )
+    mount: Mount  # where the cameras are mounted
+    cameras: FloatArray  # (..., c, 4, 4), their poses in the frame that they are mounted on
     optics: Optics  # their intrinsics
-    target: FloatArray  # (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
+    target: FloatArray  # (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame
     distance: float  # from the cameras to the target in the middle of the workspace, as planned [m]
     planned: PinholeCamera  # image of a camera as planned, whose focal length decides the natural size of a feature
     far: float  # distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m]
@@ -320,21 +339,31 @@ class SetupModel(RobotModel):
 
     def with_arm(self, arm: SerialArm) -> Self:
         """Return this model with another arm; see `RobotModel.with_arm`."""
-        moved = (arm.tool - self.arm.tool)[..., None, :] if self.mount == "fixed" else 0.0
+        moved: FloatArray | float = 0.0
+        if self.mount == "fixed":
+            # The target is on the flange, in place of the ball.
+            moved = (arm.tool - self.arm.tool)[..., None, :]
         return replace(self, arm=arm, target=self.target + moved)
 
     def with_lens(self, deviation: FloatArray) -> Self:
         """Return this model with deviating intrinsics; see `RobotModel.with_lens`."""
-        lens, (focal, *shift, bend) = self.optics, deviation
-        centre, distortion = lens.centre + np.array(shift), lens.distortion + bend
-        lens = replace(lens, focal=lens.focal * (1.0 + focal), centre=centre, distortion=distortion)
-        return replace(self, optics=lens)
+        focal, *centre_shift, distortion = deviation
+        planned = self.optics
+        optics = replace(
+            planned,
+            focal=planned.focal * (1.0 + focal),
+            centre=planned.centre + np.array(centre_shift),
+            distortion=planned.distortion + distortion,
+        )
+        return replace(self, optics=optics)
 
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
         """Return the point about which the first camera turns: for a fixed one `centre`, else on its optical axis."""
         if self.mount == "fixed":
             return np.asarray(centre, dtype=np.float64)
-        return np.asarray(self.camera[..., :3, 3] + self.distance * self.camera[..., :3, 2])
+        position = self.camera[..., :3, 3]
+        optical_axis = self.camera[..., :3, 2]
+        return np.asarray(position + self.distance * optical_axis)
 
     def points(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the target in the frame that the cameras are mounted on, (..., p, 3) m."""
@@ -375,48 +404,55 @@ class SetupModel(RobotModel):
         """Return the target in each camera, (..., c, p, 3) m, and its motion with the joints, (..., c, p, 3, n)."""
         frames = self.arm.frames(joint_position)
         flange = frames[..., -1, :, :]
-        at = self._in_base(flange)
-        motions = self.arm.motions(frames, at)
+        target = self._in_base(flange)
+        motions = self.arm.motions(frames, target)
         if self.mount == "hand":
-            motions = -np.vecmat(motions, flange[..., None, None, :3, :3])
-        points = self.in_cameras(self._mounted(flange, at))
+            # Seen from the hand, the target moves by −R_Fᵀ (g_i z_i × (t − o_i)).
+            R_BF = flange[..., None, None, :3, :3]
+            motions = -np.vecmat(motions, R_BF)
+        points = self.in_cameras(self._mounted(flange, target))
         # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
-        turned = np.vecmat(motions[..., None, :, :, :], self.cameras[..., None, None, :3, :3])
+        rotations = self.cameras[..., None, None, :3, :3]
+        turned = np.vecmat(motions[..., None, :, :, :], rotations)
         return points, np.swapaxes(turned, -1, -2)
 
     def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
         """Return which features are valid, (..., m), for points in the frame of each camera, (..., c, p, 3) m."""
         front = _incidence(points) > MIN_INCIDENCE
-        return self.setup.valid(
-            np.logical_and(in_image(points, self.optics, share), front[..., None])
-        )
+        inside = in_image(points, self.optics, share)
+        return self.setup.valid(np.logical_and(inside, front[..., None]))
 
     def _in_base(self, flange: FloatArray) -> FloatArray:
         """Return the target in the base frame, (..., p, 3) m."""
         if self.mount == "hand":
             return self.target
-        return np.asarray(
-            np.matvec(flange[..., None, :3, :3], self.target) + flange[..., None, :3, 3]
-        )
+        R_BF = flange[..., None, :3, :3]
+        p_BF = flange[..., None, :3, 3]
+        return np.asarray(np.matvec(R_BF, self.target) + p_BF)
 
-    def _mounted(self, flange: FloatArray, at: FloatArray) -> FloatArray:
+    def _mounted(self, flange: FloatArray, points: FloatArray) -> FloatArray:
         """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
         if self.mount == "fixed":
-            return at
-        return np.asarray(np.vecmat(at - flange[..., None, :3, 3], flange[..., None, :3, :3]))
+            return points
+        R_BF = flange[..., None, :3, :3]
+        p_BF = flange[..., None, :3, 3]
+        return np.asarray(np.vecmat(points - p_BF, R_BF))
 
     def in_cameras(self, points: FloatArray) -> FloatArray:
         """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
         cameras = self.cameras[..., None, :, :]
-        return np.asarray(
-            np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3])
-        )
+        from_camera = points[..., None, :, :] - cameras[..., :3, 3]
+        return np.asarray(np.vecmat(from_camera, cameras[..., :3, :3]))
 
 
 def _incidence(points: FloatArray) -> FloatArray:
     """Return the cosine of the angle between a target's normal and the ray to its middle, (...), for (..., p, 3) m."""
     if points.shape[-2] < 3:
         return np.ones(points.shape[:-2])
-    first, second = points[..., 1, :] - points[..., 0, :], points[..., 2, :] - points[..., 0, :]
-    normal, ray = np.cross(first, second), points.mean(axis=-2)
-    return np.asarray(np.vecdot(normal, ray) / np.maximum(norm(normal) * norm(ray), 1e-12))
+    corner = points[..., 0, :]
+    first_side = points[..., 1, :] - corner
+    second_side = points[..., 2, :] - corner
+    normal = np.cross(first_side, second_side)
+    ray = points.mean(axis=-2)
+    lengths = np.maximum(norm(normal) * norm(ray), 1e-12)
+    return np.asarray(np.vecdot(normal, ray) / lengths)

@@ -39,7 +39,12 @@ class ArmGeometry(NamedTuple):
     @classmethod
     def of(cls, arm: SerialArm) -> Self:
         """Return the geometry of `arm` as constants."""
-        return cls(*map(casadi.SX, (arm.translation, arm.rpy, arm.joint_offset, arm.gear_ratio)))
+        return cls(
+            translation=casadi.SX(arm.translation),
+            rpy=casadi.SX(arm.rpy),
+            joint_offset=casadi.SX(arm.joint_offset),
+            gear_ratio=casadi.SX(arm.gear_ratio),
+        )
 
 
 def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], list[SX], SX, SX]:
@@ -49,8 +54,10 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
         joint_position: q, (n, 1), rad, as reported.
         geometry: symbols or constants for n joints.
     """
-    rotation, position = symbolic_rotation(geometry.rpy[0, :]), geometry.translation[0, :].T
-    axes, origins = [], []
+    rotation = symbolic_rotation(geometry.rpy[0, :])
+    position = geometry.translation[0, :].T
+    axes = []
+    origins = []
     for i in range(joint_position.numel()):
         theta = geometry.gear_ratio[i] * joint_position[i] + geometry.joint_offset[i]
         axes.append(rotation[:, 2])
@@ -67,16 +74,16 @@ class SetupGeometry:
 
     arm: ArmGeometry  # the arm
     target: list[SX]  # p points, each (3,) [m]
-    cameras: list[
-        tuple[SX, SX]
-    ]  # of c cameras rotation (3, 3) and position (3,) [m] in the frame of their mount
+    # Rotation (3, 3) and position (3,) [m] of c cameras in the frame of their mount
+    cameras: list[tuple[SX, SX]]
     optics: Optics  # their intrinsics
 
     @classmethod
     def of(cls, arm: SerialArm, target: FloatArray, cameras: FloatArray, optics: Optics) -> Self:
         """Return the geometry of an arm, points (p, 3) m and camera poses (c, 4, 4) as constants."""
         poses = [(casadi.SX(pose[:3, :3]), casadi.SX(pose[:3, 3])) for pose in cameras]
-        return cls(ArmGeometry.of(arm), [casadi.SX(point) for point in target], poses, optics)
+        points = [casadi.SX(point) for point in target]
+        return cls(ArmGeometry.of(arm), points, poses, optics)
 
 
 def symbolic_feature(model: RobotModel) -> casadi.Function:
@@ -89,11 +96,12 @@ def symbolic_feature(model: RobotModel) -> casadi.Function:
     setup = POSITION
     mount: Mount = "fixed"
     if isinstance(model, HandEyeModel):
-        geometry = SetupGeometry.of(
-            model.arm, model.arm.tool[None], model.X_BC[None], ideal_optics(CAMERA, 1)
-        )
+        ball = model.arm.tool[None]
+        optics = ideal_optics(CAMERA, 1)
+        geometry = SetupGeometry.of(model.arm, ball, model.X_BC[None], optics)
     elif isinstance(model, SetupModel):
-        setup, mount = model.setup, model.mount
+        setup = model.setup
+        mount = model.mount
         geometry = SetupGeometry.of(model.arm, model.target, model.cameras, model.optics)
     else:
         raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
@@ -107,13 +115,15 @@ def points_in_cameras(joint_position: SX, geometry: SetupGeometry, mount: Mount)
     Args:
         joint_position: q, (n, 1), rad, as reported.
         geometry: symbols or constants.
-        mount: of the cameras.
+        mount: where the cameras are mounted.
     """
     # With a leading axis every part that the function takes is an array, and numpy calls the functions of its entries.
     points = np.empty((1, len(geometry.cameras), len(geometry.target), 3), dtype=object)
-    *_, flange, place = arm_frames(joint_position, geometry.arm)
+    *_, R_BF, p_BF = arm_frames(joint_position, geometry.arm)
     for p, target in enumerate(geometry.target):
-        mounted = place + flange @ target if mount == "fixed" else flange.T @ (target - place)
+        mounted = R_BF.T @ (target - p_BF)
+        if mount == "fixed":
+            mounted = p_BF + R_BF @ target
         for c, (rotation, position) in enumerate(geometry.cameras):
             p_C = rotation.T @ (mounted - position)
             points[0, c, p] = [p_C[0], p_C[1], p_C[2]]
@@ -135,33 +145,37 @@ def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
 
 def valid_features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
     """Return which features of points (1, c, p, 3) are valid, (m, 1) of ones and zeros; see `SetupModel.valid_at`."""
-    pixels, half = project(points, optics)[0], 0.5 * np.array(optics.size)
-    seen = []
-    for camera, (points_of_camera, pixels_of_camera) in enumerate(
-        zip(points[0], pixels, strict=True)
-    ):
-        front = _shows_front(points_of_camera)
-        for point, pixel in zip(points_of_camera, pixels_of_camera, strict=True):
-            inside = [casadi.fabs(pixel[axis] - half[axis]) <= half[axis] for axis in (0, 1)]
-            if optics.further is not None:
-                far = optics.further[camera, 5] * casadi.fmax(point[2], NEAR) ** 2
-                inside[0] = casadi.logic_and(inside[0], point[0] ** 2 + point[1] ** 2 <= far)
-            seen.append(
-                casadi.logic_and(
-                    casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)
-                )
+    pixels = project(points, optics)[0]
+    half = 0.5 * np.array(optics.size)
+    found = []
+    for camera, points_C in enumerate(points[0]):
+        front = _shows_front(points_C)
+        for point, pixel in zip(points_C, pixels[camera], strict=True):
+            inside_u, inside_v = (
+                casadi.fabs(pixel[axis] - half[axis]) <= half[axis] for axis in (0, 1)
             )
+            if optics.further is not None:
+                # Beyond the largest r² the distortion turns back: x² + y² ≤ r² z².
+                most = optics.further[camera, 5] * casadi.fmax(point[2], NEAR) ** 2
+                turns_not_back = point[0] ** 2 + point[1] ** 2 <= most
+                inside_u = casadi.logic_and(inside_u, turns_not_back)
+            inside = casadi.logic_and(inside_u, inside_v)
+            ahead = casadi.logic_and(point[2] > NEAR, front)
+            found.append(casadi.logic_and(inside, ahead))
     if setup.single:
-        return casadi.vertcat(*(each for each in seen for _ in range(setup.m // len(seen))))
-    return casadi.vertcat(*[reduce(casadi.logic_and, seen)] * setup.m)
+        repeats = setup.m // len(found)
+        return casadi.vertcat(*(each for each in found for _ in range(repeats)))
+    all_found = reduce(casadi.logic_and, found)
+    return casadi.vertcat(*[all_found] * setup.m)
 
 
 def _shows_front(points: Expressions) -> SX:
     """Return whether points (p, 3) show their front; see `MIN_INCIDENCE`."""
     if len(points) < 3:
         return casadi.SX(1.0)
-    at = [casadi.vertcat(*point) for point in points]
-    normal, ray = casadi.cross(at[1] - at[0], at[2] - at[0]), sum(at[1:], at[0]) / len(at)
+    corner, *others = (casadi.vertcat(*point) for point in points)
+    normal = casadi.cross(others[0] - corner, others[1] - corner)
+    ray = sum(others, corner) / len(points)
     lengths = casadi.fmax(casadi.norm_2(normal) * casadi.norm_2(ray), 1e-12)
     return casadi.dot(normal, ray) / lengths > MIN_INCIDENCE
 
@@ -170,17 +184,30 @@ def symbolic_rotation(rpy: SX) -> SX:
     """Return Rz(yaw) Ry(pitch) Rx(roll), (3, 3), as `servobench.plant.robot.arm.rotation_from_rpy`."""
     c: SX = casadi.cos(rpy)
     s: SX = casadi.sin(rpy)
-    roll = casadi.vertcat(
-        casadi.horzcat(1, 0, 0), casadi.horzcat(0, c[0], -s[0]), casadi.horzcat(0, s[0], c[0])
+    roll = _matrix(
+        (1, 0, 0),
+        (0, c[0], -s[0]),
+        (0, s[0], c[0]),
     )
-    pitch = casadi.vertcat(
-        casadi.horzcat(c[1], 0, s[1]), casadi.horzcat(0, 1, 0), casadi.horzcat(-s[1], 0, c[1])
+    pitch = _matrix(
+        (c[1], 0, s[1]),
+        (0, 1, 0),
+        (-s[1], 0, c[1]),
     )
     return _turn_z(rpy[2]) @ pitch @ roll
 
 
 def _turn_z(angle: SX) -> SX:
-    c, s = casadi.cos(angle), casadi.sin(angle)
-    return casadi.vertcat(
-        casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1)
+    """Return Rz(angle), (3, 3)."""
+    c = casadi.cos(angle)
+    s = casadi.sin(angle)
+    return _matrix(
+        (c, -s, 0),
+        (s, c, 0),
+        (0, 0, 1),
     )
+
+
+def _matrix(*rows: tuple[SX, ...]) -> SX:
+    """Return the matrix of rows of expressions and numbers."""
+    return casadi.vertcat(*(casadi.horzcat(*row) for row in rows))

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from servobench.plant.cameras.setups import HALF, SetupModel
+from servobench.plant.cameras.setups import HALF_SIDE, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered import urdf
 from servobench.plant.rendered.marks import MARK_COLOURS, RED
@@ -112,7 +112,11 @@ class Room:
 def target_scale(model: SetupModel, robot: Robot) -> float:
     """Return the scale of all lengths of a target and its cameras, over those of a UR5's bench."""
     side = None if robot.camera is None else robot.camera.keys.target.side
-    return robot.workspace.scale if side is None or len(model.target) == 1 else side / (2.0 * HALF)
+    return (
+        robot.workspace.scale
+        if side is None or len(model.target) == 1
+        else side / (2.0 * HALF_SIDE)
+    )
 
 
 def mark_radius(model: SetupModel, robot: Robot) -> float:

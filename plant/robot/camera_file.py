@@ -201,6 +201,13 @@ class OwnCamera:
         """Name of its file."""
         return self.files[0].name
 
+    @property
+    def pair(self) -> tuple[OwnCamera, ...]:
+        """This camera, and the second one of a stereo pair."""
+        if self.second is None:
+            return (self,)
+        return (self, self.second)
+
     @cached_property
     def pinhole(self) -> PinholeCamera:
         """An ideal camera with its size and horizontal focal length."""
