@@ -37,9 +37,8 @@ from servobench.plant.robot.robot import GRAVITY
 
 BANNER = b"pybullet build time:"  # the beginning of the line
 STANDARD_ERROR = 2  # file descriptor
-CONTACT_DISTANCE = (
-    8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
-)
+# Place of the distance in a contact point of PyBullet; it is negative where bodies overlap.
+CONTACT_DISTANCE = 8
 
 
 @contextlib.contextmanager
@@ -69,12 +68,10 @@ with without_banner():
 
 def describe_renderer() -> str:
     """Return the engine that renders images, its version, and a note if its images arrive slowly."""
-    images = (
-        ""
-        if pybullet.isNumpyEnabled()
-        else ", built without numpy: images arrive as tuples, which is slower"
-    )
-    return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
+    line = f"PyBullet {version('pybullet')}, software renderer TinyRenderer"
+    if pybullet.isNumpyEnabled():
+        return line
+    return f"{line}, built without numpy: images arrive as tuples, which is slower"
 
 
 class PhysicsWorld:
@@ -101,16 +98,17 @@ class PhysicsWorld:
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
             for name, text in files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")
-            bodies = [
-                pybullet.loadURDF(
+            bodies = []
+            for name in files:
+                if not name.endswith(".urdf"):
+                    continue
+                body = pybullet.loadURDF(
                     str(Path(folder) / name),
                     useFixedBase=True,
                     flags=pybullet.URDF_USE_INERTIA_FROM_FILE | flags,
                     physicsClientId=self.client,
                 )
-                for name in files
-                if name.endswith(".urdf")
-            ]
+                bodies.append(body)
         return int(bodies[0])
 
     def place(self, body: int, angles: FloatArray) -> None:
@@ -120,7 +118,8 @@ class PhysicsWorld:
 
     def close(self) -> None:
         """Close the world; calling it twice is allowed."""
-        client, self.client = self.client, -1
+        client = self.client
+        self.client = -1
         if client >= 0 and pybullet.isConnected(client):
             pybullet.disconnect(client)
 
@@ -174,11 +173,13 @@ class BulletScene(Scene):
         """See `Scene.render`; the projection is magnified so that the window fills the picture of TinyRenderer."""
         window = window or whole(camera)
         height, width = window.shape
+        view = view_matrix(X_BC)
         projection = magnification(camera, window) @ camera.projection_matrix()
+        # PyBullet takes matrices column by column.
         _, _, rgba, depth, _ = pybullet.getCameraImage(
             width,
             height,
-            view_matrix(X_BC).T.ravel().tolist(),
+            view.T.ravel().tolist(),
             projection.T.ravel().tolist(),
             shadow=0,
             renderer=pybullet.ER_TINY_RENDERER,
@@ -220,23 +221,24 @@ class BulletSimulation(Simulation):
             ValueError: a list of the drives that does not fit the joints.
             ConnectionError: PyBullet opens no world, as too many are open.
         """
-        arm, robot, drives = machine.arm, machine.robot, machine.drives
+        arm = machine.arm
+        robot = machine.robot
+        drives = machine.drives
         self._world = PhysicsWorld()
+        client = self._world.client
         try:
-            pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self._world.client)
-            loaded = arm_mechanics(arm, drives.payload, shapes=True, robot=robot)
-            self._arm = self._load(loaded, pybullet.URDF_USE_SELF_COLLISION)
-            self._assumed = self._load(
-                arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot)
-            )
-            room = (*room_boxes(robot.workspace.scale), *machine.boxes)
-            self._boxes = {self._load(boxes_urdf((box,))): box.name for box in room}
+            pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+            true_urdf = arm_mechanics(arm, drives.payload, shapes=True, robot=robot)
+            self._arm = self._load(true_urdf, pybullet.URDF_USE_SELF_COLLISION)
+            assumed_urdf = arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot)
+            self._assumed = self._load(assumed_urdf)
+            self._boxes = {}
+            for box in (*room_boxes(robot.workspace.scale), *machine.boxes):
+                body = self._load(boxes_urdf((box,)))
+                self._boxes[body] = box.name
             start = machine.start.tolist()
-            inertia = np.array(
-                pybullet.calculateMassMatrix(
-                    self._assumed, start, physicsClientId=self._world.client
-                )
-            )
+            mass_matrix = pybullet.calculateMassMatrix(self._assumed, start, physicsClientId=client)
+            inertia = np.array(mass_matrix)
             self._drives = Drives(
                 drives, machine.lag, inertia, machine.stops, physics_step=machine.physics_step
             )
@@ -266,28 +268,29 @@ class BulletSimulation(Simulation):
 
     def body(self, angle: FloatArray, speed: FloatArray) -> RigidBody:
         """Return inertia and torques at joint angles (n,) [rad] and speeds (n,) [rad/s]."""
-        theta, rest, client, torques = (
-            angle.tolist(),
-            self._rest,
-            self._world.client,
-            pybullet.calculateInverseDynamics,
-        )
-        return RigidBody(
-            np.array(pybullet.calculateMassMatrix(self._arm, theta, physicsClientId=client)),
-            np.array(torques(self._arm, theta, speed.tolist(), rest, physicsClientId=client)),
-            np.array(torques(self._assumed, theta, rest, rest, physicsClientId=client)),
-        )
+        client = self._world.client
+        theta = angle.tolist()
+        omega = speed.tolist()
+        rest = self._rest
+        torques = pybullet.calculateInverseDynamics
+        inertia = pybullet.calculateMassMatrix(self._arm, theta, physicsClientId=client)
+        # Without acceleration, inverse dynamics give b(θ, ω); without speed, the gravity torque alone.
+        bias = torques(self._arm, theta, omega, rest, physicsClientId=client)
+        assumed_gravity = torques(self._assumed, theta, rest, rest, physicsClientId=client)
+        return RigidBody(np.array(inertia), np.array(bias), np.array(assumed_gravity))
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
         """See `Simulation.overlaps`."""
-        client, n = self._world.client, len(angle)
+        client = self._world.client
+        last = len(angle) - 1
         self._world.place(self._arm, angle)
         pybullet.performCollisionDetection(physicsClientId=client)
         for point in pybullet.getContactPoints(bodyA=self._arm, physicsClientId=client):
             if point[CONTACT_DISTANCE] <= -MIN_OVERLAP:
-                # PyBullet counts the base as -1
-                link, other = (min(each, n - 1) + 1 for each in point[3:5])
-                yield Overlap(link, self._boxes.get(point[2], other))
+                # PyBullet counts the base as -1. Flange, tool and ball are beyond the last link and count as it.
+                _, _, body, link, other = point[:5]
+                other_link = min(other, last) + 1
+                yield Overlap(min(link, last) + 1, self._boxes.get(body, other_link))
 
     def close(self) -> None:
         """See `Simulation.close`."""

@@ -66,7 +66,7 @@ class Machine:
     robot: Robot  # by its maker's description, for masses and shapes
     boxes: tuple[Box, ...]  # obstacles other than table and floor
     drives: DriveConfig  # loops, torque limits, friction and load of the joints
-    lag: float  # [s] by which the drives smooth commanded velocities, 0 for none
+    lag: float  # [s] time constant by which the drives smooth commanded velocities, 0 for none
     start: FloatArray  # (n,) [rad], joint angles at which the loops are tuned
     stops: tuple[
         FloatArray, FloatArray
@@ -112,8 +112,7 @@ class Engine(NamedTuple):
 
     scene: type[Scene]  # for the camera
     simulation: Callable[[Machine], Simulation]  # for the motion
-    describe: Callable[
-        [], str
-    ]  # returns one line about the engine and the library that renders its images
-    # returns one line about missing parts of this machine; empty if nothing is missing
+    # Returns one line about the engine and the library that renders its images.
+    describe: Callable[[], str]
+    # Returns one line about missing parts of this machine; empty if nothing is missing.
     lacking: Callable[[], str] = str

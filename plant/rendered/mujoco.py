@@ -45,19 +45,23 @@ if mujoco.get_mju_user_warning() is None:
     # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; a wrong motion shows in the joints.
     mujoco.set_mju_user_warning(lambda _: None)
 
-# On Linux, in order of preference
+# OpenGL platforms of Linux and their libraries, in order of preference.
 LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
 ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # OpenGL platforms of other systems
 INSTALL: Final = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
-# Mesh of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
-SLICES, STACKS = (24, 6)
-AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
+# Mesh of a cylinder or sphere: MuJoCo's default of 28 slices and 16 stacks takes twice the time.
+SLICES = 24
+STACKS = 6
+AMBIENT = 0.55  # [1] light from everywhere
+DIFFUSE = 0.45  # [1] light from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
 MAX_PARTS = 1000  # largest number of drawn parts
-SHOWN, HIDDEN = 0, 5  # groups of parts, of which MuJoCo draws the first three
-COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
-# [s] time constant of stops and friction, the shortest that MuJoCo integrates well
-STIFF: float = 2.0 * PHYSICS_STEP
+# MuJoCo draws the parts of the groups 0 to 2 only.
+SHOWN_GROUP = 0
+HIDDEN_GROUP = 5
+COSTLY_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
+# [s] The time constant of stops and friction is the shortest that MuJoCo integrates well.
+CONSTRAINT_TIME: float = 2.0 * PHYSICS_STEP
 # MuJoCo would leave out shapes that are only drawn, and join bodies that do not move against each other.
 KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="false" strippath="true"/></mujoco>'
 
@@ -153,9 +157,11 @@ class MujocoScene(Scene):
         mujoco.mj_forward(self._model, self._data)  # also places the light
         self._ball = self._model.body(BALL_LINK).id
         self._drawn = mujoco.MjvScene(self._model, MAX_PARTS)
-        for name in COSTLY:
-            self._drawn.flags[getattr(mujoco.mjtRndFlag, name)] = 0
-        self._options, self._view = mujoco.MjvOption(), mujoco.MjvCamera()
+        for name in COSTLY_EFFECTS:
+            flag = getattr(mujoco.mjtRndFlag, name)
+            self._drawn.flags[flag] = 0
+        self._options = mujoco.MjvOption()
+        self._view = mujoco.MjvCamera()
         self._gl = open_context(self._model.vis.global_.offwidth, self._model.vis.global_.offheight)
         with self._gl.as_current():
             self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
@@ -176,9 +182,12 @@ class MujocoScene(Scene):
     ) -> Image:
         """See `Scene.render`."""
         rgb, depth = self.draw(camera, X_BC, window or whole(camera))
-        # Beyond the floor is black, to be white. A sky of MuJoCo's would stand in front of far things.
-        cv2.bitwise_not(rgb, dst=rgb, mask=cv2.inRange(depth, np.zeros(1), np.zeros(1)))
-        return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
+        # Pixels that no body covers have depth 0; they are black and become white.
+        # MuJoCo's own sky would stand in front of far things.
+        empty = cv2.inRange(depth, np.zeros(1), np.zeros(1))
+        cv2.bitwise_not(rgb, dst=rgb, mask=empty)
+        colours = rgb[::-1].copy()
+        return colours, 1.0 - depth[::-1].astype(np.float64)
 
     def draw(
         self, camera: PinholeCamera, X_BC: FloatArray, window: Window
@@ -194,30 +203,43 @@ class MujocoScene(Scene):
         )
         for gl_camera in self._drawn.camera:
             _aim(gl_camera, camera, X_BC)
-        shape, context = window.shape, self._context
-        part = (window.left, camera.height - window.bottom, *shape[::-1])
-        rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
+        height, width = window.shape
+        # OpenGL counts rows from the lowest one.
+        part = (window.left, camera.height - window.bottom, width, height)
+        rgb = np.empty((height, width, 3), dtype=np.uint8)
+        depth = np.empty((height, width), dtype=np.float32)
+        context = self._context
         with self._gl.as_current(), scissors(*part):
             if camera.width > context.offWidth or camera.height > context.offHeight:
-                size = max(camera.width, context.offWidth), max(camera.height, context.offHeight)
-                mujoco.mjr_resizeOffscreen(*size, context)
-            mujoco.mjr_render(
-                mujoco.MjrRect(0, 0, camera.width, camera.height), self._drawn, context
-            )
+                wider = max(camera.width, context.offWidth)
+                higher = max(camera.height, context.offHeight)
+                mujoco.mjr_resizeOffscreen(wider, higher, context)
+            image = mujoco.MjrRect(0, 0, camera.width, camera.height)
+            mujoco.mjr_render(image, self._drawn, context)
             mujoco.mjr_readPixels(rgb, depth, mujoco.MjrRect(*part), context)
         return rgb, depth
 
     def _leave_out(self, camera: PinholeCamera, X_BC: FloatArray, window: Window) -> None:
         """Hide the parts whose bounding spheres are outside of the pyramid of rays through a window."""
-        columns, rows = (window.left, window.right), (window.top, window.bottom)
+        columns = (window.left, window.right)
+        rows = (window.top, window.bottom)
         (left, top, _), (right, bottom, _) = camera.rays(columns, rows).tolist()
-        inwards = np.array(
-            [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+        # Normals of the pyramid's four planes, which meet in the camera and point inwards; camera frame.
+        normals = np.array(
+            [
+                [1.0, 0.0, -left],
+                [-1.0, 0.0, right],
+                [0.0, 1.0, -top],
+                [0.0, -1.0, bottom],
+            ]
         )
-        inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
-        centres = (self._data.geom_xpos - X_BC[:3, 3]) @ (X_BC[:3, :3] @ inwards.T)
-        reached = (centres >= -self._model.geom_rbound[:, None]).all(axis=1)
-        self._model.geom_group[:] = np.where(reached, SHOWN, HIDDEN)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        # Distance of each part's centre from each plane, positive inside.
+        from_camera = self._data.geom_xpos - X_BC[:3, 3]
+        distances = from_camera @ (X_BC[:3, :3] @ normals.T)
+        radii = self._model.geom_rbound[:, None]
+        reached = (distances >= -radii).all(axis=1)
+        self._model.geom_group[:] = np.where(reached, SHOWN_GROUP, HIDDEN_GROUP)
 
     def close(self) -> None:
         """See `Scene.close`."""
@@ -231,10 +253,10 @@ class MujocoScene(Scene):
 def _compile(room: Room) -> Any:  # noqa: ANN401
     """Return the model of all drawn bodies, an `MjModel`."""
     files = room.files()
-    (_, spec), *around = [
-        (name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")
-    ]
-    for name, body in around:
+    arm_name, *other_names = [name for name in files if name.endswith(".urdf")]
+    spec = read_urdf(files[arm_name], files)
+    for name in other_names:
+        body = read_urdf(files[name], files)
         spec.attach(body, prefix=f"{name}/", frame=spec.worldbody.add_frame())
     spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -246,24 +268,32 @@ def _compile(room: Room) -> Any:  # noqa: ANN401
     )
     visual = spec.visual
     visual.headlight.active = 0
-    visual.quality.offsamples, visual.quality.shadowsize = 0, 0
-    visual.quality.numslices, visual.quality.numstacks, visual.quality.numquads = SLICES, STACKS, 1
+    quality = visual.quality
+    quality.offsamples = 0
+    quality.shadowsize = 0
+    quality.numslices = SLICES
+    quality.numstacks = STACKS
+    quality.numquads = 1
     return spec.compile()
 
 
 def _aim(gl_camera: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # noqa: ANN401 - an `MjvGLCamera`
     """Give a camera of OpenGL the pose X_BC (4, 4) and the pixels of `camera`."""
-    gl_camera.pos, gl_camera.forward, gl_camera.up = X_BC[:3, 3], X_BC[:3, 2], -X_BC[:3, 1]
-    pixel = camera.near / camera.focal  # [m] of a pixel on the near plane
-    right, down = pixel * (PIXEL_CENTRE[0] - 0.5), pixel * (PIXEL_CENTRE[1] - 0.5)
+    gl_camera.pos = X_BC[:3, 3]
+    gl_camera.forward = X_BC[:3, 2]
+    gl_camera.up = -X_BC[:3, 1]
+    pixel = camera.near / camera.focal  # [m] side of a pixel on the near plane
+    # OpenGL samples a pixel at (0.5, 0.5), the camera at PIXEL_CENTRE: the frustum moves by the difference.
+    right = pixel * (PIXEL_CENTRE[0] - 0.5)
+    down = pixel * (PIXEL_CENTRE[1] - 0.5)
     half = 0.5 * camera.height * pixel
-    gl_camera.frustum_center, gl_camera.frustum_width = right, 0.5 * camera.width * pixel
-    gl_camera.frustum_bottom, gl_camera.frustum_top = -half - down, half - down
-    gl_camera.frustum_near, gl_camera.frustum_far, gl_camera.orthographic = (
-        camera.near,
-        camera.far,
-        0,
-    )
+    gl_camera.frustum_center = right
+    gl_camera.frustum_width = 0.5 * camera.width * pixel
+    gl_camera.frustum_bottom = -half - down
+    gl_camera.frustum_top = half - down
+    gl_camera.frustum_near = camera.near
+    gl_camera.frustum_far = camera.far
+    gl_camera.orthographic = 0
 
 
 class MujocoSimulation(Simulation):
@@ -291,8 +321,10 @@ class MujocoSimulation(Simulation):
         self._model = _moving(machine)
         self._data = mujoco.MjData(self._model)
         self._shapes, self._boxes = _solid(machine)
-        self._placed, self._bodies = mujoco.MjData(self._shapes), self._shapes.geom_bodyid.tolist()
-        body = self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp
+        self._placed = mujoco.MjData(self._shapes)
+        self._bodies = self._shapes.geom_bodyid.tolist()
+        # The drives read and write MuJoCo's own arrays.
+        body = (self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp)
         inertia = _assumed_inertia(machine)
         self._drives = Drives(
             drives, machine.lag, inertia, machine.stops, body, machine.physics_step
@@ -300,42 +332,59 @@ class MujocoSimulation(Simulation):
 
     def start(self, angle: FloatArray) -> DriveState:
         """See `Simulation.start`."""
-        data, rest = self._data, np.zeros(self._n)
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = angle, rest, rest
+        data = self._data
+        data.qpos[:] = angle
+        data.qvel[:] = 0.0
+        data.qacc_warmstart[:] = 0.0
         data.qfrc_applied[:] = 0.0
         mujoco.mj_step1(self._model, data)
-        return DriveState(angle, rest, angle, rest, data.qfrc_bias - data.qfrc_gravcomp, rest)
+        rest = np.zeros(self._n)
+        # The integral carries the gravity that the compensation leaves.
+        integral = data.qfrc_bias - data.qfrc_gravcomp
+        return DriveState(angle, rest, angle, rest, integral, rest)
 
     def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
         """See `Simulation.advance`."""
-        drives, model, data = self._drives, self._model, self._data
+        drives = self._drives
         drives.take(joints, speed)
         if not self._dynamics:
             for _ in range(steps):
                 drives.track()
             return drives.give()
+        model = self._model
+        data = self._data
         data.qacc_warmstart[:] = joints.acceleration
-        torque, compensation, applied = drives.torque, data.qfrc_gravcomp, data.qfrc_applied
+        torque = drives.torque
+        compensation = data.qfrc_gravcomp
+        applied = data.qfrc_applied
         for _ in range(steps):
             mujoco.mj_step1(model, data)
             drives.step()
             np.subtract(torque, compensation, out=applied)  # MuJoCo adds the compensation itself
             mujoco.mj_step2(model, data)
-        return drives.give()._replace(acceleration=data.qacc_warmstart.copy())
+        moved = drives.give()
+        return moved._replace(acceleration=data.qacc_warmstart.copy())
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
         """See `Simulation.overlaps`."""
-        model, data, bodies = self._shapes, self._placed, self._bodies
+        model = self._shapes
+        data = self._placed
         data.qpos[:] = angle
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         if not data.ncon:
             return
-        for pair in data.contact.geom[data.contact.dist <= -MIN_OVERLAP].tolist():
-            first, second = sorted(bodies[part] for part in pair)
-            link = min(second - 1, self._n)  # MuJoCo counts the world as 0, the base as 1
-            yield Overlap(link, self._boxes[min(pair)] if first == 0 else min(first - 1, self._n))
+        overlapping = data.contact.dist <= -MIN_OVERLAP
+        for pair in data.contact.geom[overlapping].tolist():
+            # MuJoCo counts the world as 0, the base as 1. Boxes belong to the world; flange, tool and ball are
+            # bodies beyond the last link and count as it.
+            first, second = sorted(self._bodies[part] for part in pair)
+            link = min(second - 1, self._n)
+            if first == 0:
+                yield Overlap(link, self._boxes[min(pair)])
+            else:
+                yield Overlap(link, min(first - 1, self._n))
 
     def close(self) -> None:
         """See `Simulation.close`; MuJoCo frees its memory with the object."""
@@ -352,20 +401,20 @@ def _moving(machine: Machine) -> Any:  # noqa: ANN401
     # Joints that are not finite have to be detected.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     for joint, lower, upper in zip(spec.joints, *machine.stops, strict=True):
-        joint.limited, joint.range = True, (lower, upper)
+        joint.limited = True
+        joint.range = (lower, upper)
     model = spec.compile()
     model.dof_armature[:] = drives.rotor_inertia
-    model.dof_damping[:], model.dof_frictionloss[:] = (
-        drives.viscous_friction,
-        drives.coulomb_friction,
-    )
+    model.dof_damping[:] = drives.viscous_friction
+    model.dof_frictionloss[:] = drives.coulomb_friction
     for solution in (model.jnt_solref, model.dof_solref):
-        solution[:] = STIFF, 1.0
+        solution[:] = (CONSTRAINT_TIME, 1.0)
+    # MuJoCo compensates each body's gravity in full, and the ball's in proportion to its assumed mass.
     model.body_gravcomp[:] = 1.0
-    light = LIGHT_PART[0]
-    model.body_gravcomp[model.body(BALL_LINK).id] = (light + drives.assumed_payload) / (
-        light + drives.payload
-    )
+    ball_mass = LIGHT_PART[0]
+    true_mass = ball_mass + drives.payload
+    assumed_mass = ball_mass + drives.assumed_payload
+    model.body_gravcomp[model.body(BALL_LINK).id] = assumed_mass / true_mass
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
@@ -373,12 +422,13 @@ def _moving(machine: Machine) -> Any:  # noqa: ANN401
 def _assumed_inertia(machine: Machine) -> FloatArray:
     """Return the inertia of links and assumed load at the start, (n, n) [kg m²], without the rotors."""
     payload = machine.drives.assumed_payload
-    model = read_urdf(
-        arm_mechanics(machine.arm, payload, shapes=False, robot=machine.robot)
-    ).compile()
-    data, columns = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    urdf = arm_mechanics(machine.arm, payload, shapes=False, robot=machine.robot)
+    model = read_urdf(urdf).compile()
+    data = mujoco.MjData(model)
     data.qpos[:] = machine.start
     mujoco.mj_forward(model, data)
+    # Multiplying by unit vectors gives the columns of the mass matrix.
+    columns = np.empty((model.nv, model.nv))
     for column, joint in zip(columns, np.eye(model.nv), strict=True):
         mujoco.mj_mulM(model, data, column, joint)
     return columns

@@ -46,10 +46,8 @@ def mujoco_lacks() -> str:
     """Return how to install the renderer that this machine lacks; empty if it can render."""
     try:
         return load_engine("mujoco").lacking()
-    except (
-        ImportError,
-        RuntimeError,
-    ) as error:  # incompatible parts, or a MUJOCO_GL that MuJoCo does not know
+    except (ImportError, RuntimeError) as error:
+        # The parts do not fit each other, or MuJoCo does not know the word in MUJOCO_GL.
         return f"MuJoCo cannot be loaded: {error}"
 
 
