@@ -32,13 +32,14 @@ FULL_BOX = 0.6  # share of red pixels above which a box holds one patch; a disc 
 MIN_PIXELS = 16  # fewer pixels do not determine three coordinates under noise
 MIN_VISIBLE = 0.4  # share of the ball's disc that must be visible
 MAX_VISIBLE = 1.4  # a larger red patch is not the ball
+MIN_USED = 0.5  # share of the patch's depths that must agree with the sphere
 INNER_COSINE = 0.4  # cosine of the angle between ray and surface normal below which a pixel counts as silhouette
 OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
 OUTLIER_FLOOR = 0.002  # [m] a smaller deviation is no outlier
+DEVIATION_OF_MEDIAN = 1.4826  # [1] standard deviation of a normal error over the median of its size
 MAX_RESIDUAL = 0.75  # RMS as a share of the radius beyond which the fit is implausible
-MAX_UNCERTAINTY = (
-    0.2  # standard error as a share of the radius beyond which the fit is too uncertain
-)
+# Standard error as a share of the radius beyond which the fit is too uncertain
+MAX_UNCERTAINTY = 0.2
 SELECTION_ITERATIONS = 3  # number of iterations that select the depths again
 MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
@@ -76,9 +77,9 @@ def find_patch(rgb: ByteArray) -> Patch | None:
     Returns:
         The patch, or None where there is none, it is too small, or the image's border cuts it.
     """
-    return largest_patch(
-        np.asarray(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), *RED_RANGE), dtype=np.uint8)
-    )
+    hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
+    mask = cv2.inRange(hsv, *RED_RANGE)
+    return largest_patch(np.asarray(mask, dtype=np.uint8))
 
 
 def largest_patch(mask: ByteArray) -> Patch | None:
@@ -99,17 +100,21 @@ def largest_patch(mask: ByteArray) -> Patch | None:
         _, labels, statistics, _ = cv2.connectedComponentsWithStats(
             coloured.astype(np.uint8), connectivity=8
         )
-        coloured = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+        areas = statistics[1:, cv2.CC_STAT_AREA]
+        # Label 0 is the background.
+        coloured = labels == 1 + int(np.argmax(areas))
     rows, columns = np.nonzero(coloured)
-    rows, columns = rows + y, columns + x
-    image_height, image_width = mask.shape
-    cut = (
-        rows[0] == 0
-        or rows[-1] == image_height - 1
-        or columns.min() == 0
-        or columns.max() == image_width - 1
-    )
-    return None if cut or len(rows) < MIN_PIXELS else Patch(rows, columns)
+    if len(rows) < MIN_PIXELS:
+        return None
+    rows = rows + y
+    columns = columns + x
+    last_row = mask.shape[0] - 1
+    last_column = mask.shape[1] - 1
+    cut_vertically = rows[0] == 0 or rows[-1] == last_row
+    cut_horizontally = columns.min() == 0 or columns.max() == last_column
+    if cut_vertically or cut_horizontally:
+        return None
+    return Patch(rows, columns)
 
 
 def add_colour_noise(rgb: ByteArray, deviation: float, generator: np.random.Generator) -> ByteArray:
@@ -144,16 +149,18 @@ def locate_ball(
     rays = camera.rays(patch.columns, patch.rows)
     middle = np.array([np.median(rays[:, 0]), np.median(rays[:, 1]), 1.0])
     # The median depth over a sphere's disc is R/√2 nearer than its centre.
-    start = middle * (float(np.median(depth)) + radius / np.sqrt(2.0))
-    fit = fit_sphere(rays, depth, start, radius)
+    centre_depth = float(np.median(depth)) + radius / np.sqrt(2.0)
+    fit = fit_sphere(rays, depth, middle * centre_depth, radius)
     if fit is None or not fit.centre[2] > radius:
         return None
-    visible = len(depth) / disc_area(fit.centre, camera, radius)
-    plausible = (
-        fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
-    )
-    complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
-    return fit if plausible and complete else None
+    plausible = fit.residual <= MAX_RESIDUAL * radius
+    certain = fit.uncertainty <= MAX_UNCERTAINTY * radius
+    visible_share = len(depth) / disc_area(fit.centre, camera, radius)
+    complete = MIN_VISIBLE <= visible_share <= MAX_VISIBLE
+    mostly_used = fit.used >= MIN_USED * len(depth)
+    if plausible and certain and complete and mostly_used:
+        return fit
+    return None
 
 
 def find_ball(
@@ -170,17 +177,15 @@ def find_ball(
     patch = find_patch(rgb)
     if patch is None:
         return None
-    return locate_ball(
-        patch, camera.metric_depth(buffer[patch.rows, patch.columns]), camera, radius
-    )
+    depth = camera.metric_depth(buffer[patch.rows, patch.columns])
+    return locate_ball(patch, depth, camera, radius)
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
     """Return the area, px², of the ellipse of a sphere at `centre` (3,) m, which is stretched off the optical axis."""
-    nearest2 = centre[2] ** 2 - radius**2
-    return float(
-        np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3)
-    )
+    tangent2 = centre @ centre - radius**2  # squared length of the tangents from the lens
+    depth2 = centre[2] ** 2 - radius**2
+    return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt(tangent2 / depth2**3))
 
 
 def fit_sphere(
@@ -204,29 +209,35 @@ def fit_sphere(
             chosen = choose_depths(rays, depth, centre, radius)
             if len(chosen) < MIN_PIXELS:
                 return None
-            r, z = rays[chosen], depth[chosen]
+            r = rays[chosen]
+            z = depth[chosen]
         t, root = first_hit(r, centre, radius)
         e = z - t
+        # ∂t/∂c = −(t r − c)/√D, a row for each depth.
         slope = (centre - t[:, None] * r) / root[:, None]
         normal = slope.T @ slope + RIDGE * len(e)
         step = np.linalg.solve(normal, slope.T @ e)
         length = math.sqrt(step @ step)
         # The linearisation does not hold beyond a step of one radius.
-        centre = centre + step * min(1.0, radius / max(length, radius))
+        shortening = min(1.0, radius / max(length, radius))
+        centre = centre + step * shortening
         if iteration >= SELECTION_ITERATIONS and length < STEP_TOLERANCE:
             break
     residual = math.sqrt(e @ e / len(e))
     # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.
-    return Detection(
-        centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal)))
-    )
+    covariance = np.linalg.inv(normal)
+    uncertainty = residual * math.sqrt(np.trace(covariance))
+    return Detection(centre, residual, len(e), uncertainty)
 
 
 def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
     """Return where rays (k, 3) first meet a sphere: the depths t (k,) m and the roots √D (k,); D is kept positive."""
-    length2, along = np.einsum("ij,ij->i", rays, rays), rays @ centre
+    length2 = np.einsum("ij,ij->i", rays, rays)
+    along = rays @ centre
     D = along * along - length2 * (centre @ centre - radius**2)
-    root = np.sqrt(np.maximum(D, (0.1 * INNER_COSINE * radius) ** 2))
+    # Rays that miss the sphere, or nearly, have a root far below that of the silhouette's pixels.
+    least = (0.1 * INNER_COSINE * radius) ** 2
+    root = np.sqrt(np.maximum(D, least))
     return (along - root) / length2, root
 
 
@@ -235,15 +246,16 @@ def choose_depths(
 ) -> IntArray:
     """Return the indices of the rays that meet the sphere well inside its silhouette and whose depth is no outlier."""
     t, root = first_hit(rays, centre, radius)
-    inner = np.flatnonzero(
-        root >= INNER_COSINE * radius * np.sqrt(np.einsum("ij,ij->i", rays, rays))
-    )
+    # √D is R |r| times the cosine of the angle between ray and surface normal.
+    length = np.sqrt(np.einsum("ij,ij->i", rays, rays))
+    inner = np.flatnonzero(root >= INNER_COSINE * radius * length)
     if len(inner) == 0:
         return inner
     size = np.abs(depth[inner] - t[inner])
     middle = len(inner) // 2
-    # 1.4826 times the median size estimates the standard deviation in spite of outliers.
-    gate = max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.partition(size, middle)[middle]))
+    median = float(np.partition(size, middle)[middle])
+    # The median estimates the standard deviation in spite of outliers.
+    gate = max(OUTLIER_FLOOR, OUTLIER_SCALE * DEVIATION_OF_MEDIAN * median)
     return inner[size <= gate]
 
 
@@ -263,22 +275,17 @@ def draw_detection(
         return picture
     shift = 4  # OpenCV takes fractions of pixels as integers shifted by this many bits
     u, v = camera.project(detection.centre)
-    centre = (round(u * 2**shift), round(v * 2**shift))
+    x = round(u * 2**shift)
+    y = round(v * 2**shift)
     size = camera.focal * radius / detection.centre[2]
     thickness = max(1, round(camera.height / 360))
-    cv2.circle(
-        picture,
-        centre,
-        round((size + 1.5 * thickness) * 2**shift),
-        OUTLINE,
-        thickness,
-        cv2.LINE_AA,
-        shift,
-    )
+    outline = round((size + 1.5 * thickness) * 2**shift)
+    cv2.circle(picture, (x, y), outline, OUTLINE, thickness, cv2.LINE_AA, shift)
     arm = round(0.45 * size * 2**shift)
     for dx, dy in ((arm, 0), (0, arm)):
-        ends = ((centre[0] - dx, centre[1] - dy), (centre[0] + dx, centre[1] + dy))
-        cv2.line(picture, *ends, OUTLINE, thickness, cv2.LINE_AA, shift)
+        start = (x - dx, y - dy)
+        end = (x + dx, y + dy)
+        cv2.line(picture, start, end, OUTLINE, thickness, cv2.LINE_AA, shift)
     return picture
 
 
@@ -325,30 +332,36 @@ def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> W
         camera: its intrinsics.
     """
     x, y, z = centre.tolist()
+    if z < -radius:
+        return None
     if z <= radius + camera.near:
-        return None if z < -radius else whole(camera)
+        return whole(camera)
     depth2 = z * z - radius * radius
-    sides = -radius, radius
-    ends = [
-        [(at * z + side * math.sqrt(at * at + depth2)) / depth2 for at in (x, y)] + [1.0]
-        for side in sides
-    ]
-    (left, top), (right, bottom) = camera.project(ends).tolist()
+    wide = math.sqrt(x * x + depth2)
+    high = math.sqrt(y * y + depth2)
+    lower_end = [(x * z - radius * wide) / depth2, (y * z - radius * high) / depth2, 1.0]
+    upper_end = [(x * z + radius * wide) / depth2, (y * z + radius * high) / depth2, 1.0]
+    (left, top), (right, bottom) = camera.project([lower_end, upper_end]).tolist()
     window = Window(
-        max(0, math.floor(top) - MARGIN),
-        max(0, math.floor(left) - MARGIN),
-        min(camera.height, math.ceil(bottom) + 1 + MARGIN),
-        min(camera.width, math.ceil(right) + 1 + MARGIN),
+        top=max(0, math.floor(top) - MARGIN),
+        left=max(0, math.floor(left) - MARGIN),
+        bottom=min(camera.height, math.ceil(bottom) + 1 + MARGIN),
+        right=min(camera.width, math.ceil(right) + 1 + MARGIN),
     )
-    return window if window.top < window.bottom and window.left < window.right else None
+    if window.top >= window.bottom or window.left >= window.right:
+        return None
+    return window
 
 
 def window_around_all(centres: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
     """Return the window outside of which no pixel shows any of the balls or discs, (p, 3) m; see `window_around`."""
     windows = [window_around(centre, radius, camera) for centre in centres]
-    shown = np.array([window for window in windows if window is not None])
-    if len(shown) == 0:
+    shown = [window for window in windows if window is not None]
+    if not shown:
         return None
-    top, left = shown[:, :2].min(axis=0).tolist()
-    bottom, right = shown[:, 2:].max(axis=0).tolist()
-    return Window(top, left, bottom, right)
+    return Window(
+        top=min(window.top for window in shown),
+        left=min(window.left for window in shown),
+        bottom=max(window.bottom for window in shown),
+        right=max(window.right for window in shown),
+    )

@@ -63,12 +63,14 @@ from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.robot import Robot
 
 MAX_SIZE: Final = (
-    1024  # [px] of an ideal image's side: a lens with a wider view is black at its edges
+    1024  # [px] largest side of an ideal image: a lens with a wider view is black at its edges
 )
-# Stands for a point that is not found, whose features are not valid
+# Stands for a point that is not found, whose features are not valid.
 NOWHERE: Final = (0.0, 0.0, 1.0)
 CROSS: Final = 5  # [px] half size of the cross that marks a point in a picture
-DEPTH, COLOUR = "depth_noise", "colour_noise"  # names of the random streams
+# Names of the random streams.
+DEPTH: Final = "depth_noise"
+COLOUR: Final = "colour_noise"
 
 Model = TypeVar("Model", bound=RobotModel)
 
@@ -118,13 +120,16 @@ class Lens:
         if as_planned(own, planned):
             return
         rays = _rays(planned, own)
-        half = np.abs(rays[:, :2]).max(axis=0) * own.focal[0] + 2.0
+        # The ideal image reaches as far as the widest ray, with two pixels to spare.
+        half_width, half_height = (np.abs(rays[:, :2]).max(axis=0) * own.focal[0] + 2.0).tolist()
         largest = max(MAX_SIZE, 2 * planned.width, 2 * planned.height)
-        width, height = (min(largest, 2 * math.ceil(size)) for size in half.tolist())
+        width = min(largest, 2 * math.ceil(half_width))
+        height = min(largest, 2 * math.ceil(half_height))
         fov = 2.0 * math.degrees(math.atan(0.5 * height / own.focal[0]))
         self._ideal = replace(planned, width=width, height=height, vertical_fov=fov)
-        at = self._ideal.project(rays).astype(np.float32).reshape(planned.height, planned.width, 2)
-        self._map = at[..., 0], at[..., 1]
+        sources = self._ideal.project(rays).astype(np.float32)
+        sources = sources.reshape(planned.height, planned.width, 2)
+        self._map = (sources[..., 0], sources[..., 1])
 
     def view(self, points: FloatArray, radius: float) -> View | None:
         """Return the view of balls or discs; None where none appears.
@@ -134,17 +139,16 @@ class Lens:
             radius: [m].
         """
         ideal = window_around_all(points, radius, self._ideal)
-        if ideal is None or self._map is None:
-            return None if ideal is None else View(ideal, ideal)
+        if ideal is None:
+            return None
+        if self._map is None:
+            return View(ideal, ideal)
         columns, rows = self._map
-        shown = (
-            (columns >= ideal.left)
-            & (columns < ideal.right)
-            & (rows >= ideal.top)
-            & (rows < ideal.bottom)
-        )
+        in_columns = (columns >= ideal.left) & (columns < ideal.right)
+        in_rows = (rows >= ideal.top) & (rows < ideal.bottom)
+        shown = in_columns & in_rows
         left, top, width, height = cv2.boundingRect(shown.astype(np.uint8))
-        if width == 0:  # only the ideal image is wide enough to show them
+        if width == 0:  # Only the ideal image is wide enough to show them.
             return None
         return View(ideal, Window(top, left, top + height, left + width))
 
@@ -162,11 +166,15 @@ class Lens:
 
 def as_planned(optics: Optics, planned: PinholeCamera) -> bool:
     """Return whether cameras have the intrinsics that are planned."""
+    if optics.further is not None:
+        return False
     plain = ideal_optics(planned, 1)
-    return optics.further is None and all(
-        np.allclose(getattr(optics, part), getattr(plain, part), rtol=1e-12, atol=0.0)
-        for part in ("focal", "centre", "distortion")
+    pairs = (
+        (optics.focal, plain.focal),
+        (optics.centre, plain.centre),
+        (optics.distortion, plain.distortion),
     )
+    return all(np.allclose(own, ideal, rtol=1e-12, atol=0.0) for own, ideal in pairs)
 
 
 def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
@@ -174,8 +182,10 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
     columns, rows = np.meshgrid(np.arange(planned.width), np.arange(planned.height))
     half = np.array([planned.width, planned.height]) / 2.0
     # The planned camera says where a pixel is sampled, counted from the upper left corner.
-    pixels = half + planned.focal * planned.rays(columns.ravel(), rows.ravel())[:, :2]
-    return np.asarray(locate(pixels[None], np.ones((1, 1)), optics)[0])
+    tangents = planned.rays(columns.ravel(), rows.ravel())[:, :2]
+    pixels = half + planned.focal * tangents
+    points = locate(pixels[None], np.ones((1, 1)), optics)
+    return np.asarray(points[0])
 
 
 @final
@@ -186,8 +196,10 @@ class DepthCamera:
         self, scene: Scene, config: RenderedConfig, camera: PinholeCamera, radius: float
     ) -> None:
         """Take a scene and the radius of its ball [m]."""
-        self.camera, self.radius = camera, radius
-        self._scene, self._config = scene, config
+        self.camera = camera
+        self.radius = radius
+        self._scene = scene
+        self._config = config
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
     def find(
@@ -201,7 +213,8 @@ class DepthCamera:
             noise: of depths and colours.
             number: of the camera, each of which has noise of its own.
         """
-        window = window_around(X_BC[:3, :3].T @ (ball - X_BC[:3, 3]), self.radius, self.camera)
+        p_C = X_BC[:3, :3].T @ (ball - X_BC[:3, 3])
+        window = window_around(p_C, self.radius, self.camera)
         if window is None:
             return None
         rgba, buffer = self._scene.render(self.camera, X_BC, window)
@@ -215,8 +228,8 @@ class DepthCamera:
             self._config, depth, patch, window.shape, self.camera, noise.stream(DEPTH, number)
         )
         # A patch touches the border of the window only where the image ends, too.
-        patch = Patch(patch.rows + window.top, patch.columns + window.left)
-        return locate_ball(patch, measured, self.camera, self.radius)
+        in_image = Patch(patch.rows + window.top, patch.columns + window.left)
+        return locate_ball(in_image, measured, self.camera, self.radius)
 
     def picture(self, X_BC: FloatArray) -> ByteArray:
         """Return the image from X_BC (4, 4) without noise, with the detected ball marked, (h, w, 3)."""
@@ -259,11 +272,9 @@ class BallDetector(Detector[HandEyeModel]):
 
     def __init__(self, scene: Scene, config: RenderedConfig, robot: Robot) -> None:
         """Take a scene with a ball on the flange of a robot."""
-        camera, ball_radius = (
-            CAMERA.reaching(robot.workspace.camera_distance),
-            robot.workspace.ball_radius,
-        )
-        self._scene, self._camera = scene, DepthCamera(scene, config, camera, ball_radius)
+        camera = CAMERA.reaching(robot.workspace.camera_distance)
+        self._scene = scene
+        self._camera = DepthCamera(scene, config, camera, robot.workspace.ball_radius)
 
     def measure(
         self, model: HandEyeModel, q: FloatArray, noise: ImageNoise
@@ -277,15 +288,19 @@ class BallDetector(Detector[HandEyeModel]):
 
     def truth(self, model: HandEyeModel, q: FloatArray) -> Truth:
         """Return the feature by the simulator's own ball, and the Jacobian of the true model."""
-        return Truth(model.to_camera(self._scene.ball_position()), model.jacobian(q))
+        feature = model.to_camera(self._scene.ball_position())
+        return Truth(feature, model.jacobian(q))
 
     def why_missing(self, model: HandEyeModel, q: FloatArray, valid: BoolArray | None) -> str:
         """Return where the ball is and would appear."""
-        true, camera = model.to_camera(self._scene.ball_position()), self._camera.camera
-        clipped = camera.clipping([true[2] - self._camera.radius, true[2] + self._camera.radius])
+        camera = self._camera.camera
+        radius = self._camera.radius
+        true = model.to_camera(self._scene.ball_position())
+        pixel = camera.project(true)
+        clipped = camera.clipping([true[2] - radius, true[2] + radius])
         return (
             f"the ball is not visible at the start {q.round(6).tolist()}: it is at {true.round(3).tolist()} m in "
-            f"the camera frame, column and row {camera.project(true).round(1).tolist()} of an image of "
+            f"the camera frame, column and row {pixel.round(1).tolist()} of an image of "
             f"{camera.width} x {camera.height}; it is {clipped}hidden, out of sight, too small or cut by the border"
         )
 
@@ -302,13 +317,14 @@ class MarkCameras:
         self, model: SetupModel, scene: Scene, config: RenderedConfig, radius: float
     ) -> None:
         """Take a scene with the target of a set-up, whose ball or discs have a radius [m]."""
-        self._scene, self._planned = scene, model.planned.reaching(model.distance)
-        self._lenses = [
-            Lens(self._planned, model.optics, camera) for camera in range(model.setup.cameras)
-        ]
+        self._scene = scene
+        self._planned = model.planned.reaching(model.distance)
+        cameras = range(model.setup.cameras)
+        self._lenses = [Lens(self._planned, model.optics, camera) for camera in cameras]
         self._radius = radius
-        self._colours = MARK_COLOURS[: len(model.target)]
-        self._centre = sphere_centre if len(model.target) == 1 else disc_centre
+        points = len(model.target)
+        self._colours = MARK_COLOURS[:points]
+        self._centre = sphere_centre if points == 1 else disc_centre
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
     def find(
@@ -317,16 +333,17 @@ class MarkCameras:
         """Return the points in the frame of each camera, (c, p, 3) m at a depth of 1 m, and which are found, (c, p)."""
         marks: list[Sequence[Mark | None]] = []
         poses = camera_poses(model, q)
-        for number, at in enumerate(model.in_cameras(model.points(q))):
+        for number, target in enumerate(model.in_cameras(model.points(q))):
             lens = self._lenses[number]
-            view = lens.view(at, self._radius)
+            view = lens.view(target, self._radius)
             if view is None:
                 marks.append([None] * len(self._colours))
                 continue
             image = lens.render(self._scene, poses[number], view)
             if self._deviation > 0.0:
                 image = add_colour_noise(image, self._deviation, noise.stream(COLOUR, number))
-            marks.append(find_marks(image, self._colours, (view.part.top, view.part.left)))
+            corner = (view.part.top, view.part.left)
+            marks.append(find_marks(image, self._colours, corner))
         found, pixels = self._measure(marks)
         points = locate(pixels, np.ones(found.shape), model.optics)
         points[~found] = NOWHERE
@@ -338,20 +355,27 @@ class MarkCameras:
         for lens, pose in zip(self._lenses, camera_poses(model, q), strict=True):
             image = lens.render(self._scene, pose)
             images.append(np.ascontiguousarray(image[..., :3]))
-        measured = self._measure([find_marks(image, self._colours) for image in images])
-        for image, found, pixels in zip(images, *measured, strict=True):
-            for u, v in pixels[found].round().astype(int).tolist():
+        marks = [find_marks(image, self._colours) for image in images]
+        found, pixels = self._measure(marks)
+        for image, own_found, own_pixels in zip(images, found, pixels, strict=True):
+            for u, v in own_pixels[own_found].round().astype(int).tolist():
                 cv2.drawMarker(image, (u, v), OUTLINE, cv2.MARKER_CROSS, 2 * CROSS)
         return np.concatenate(images, axis=1)
 
     def _measure(self, marks: Sequence[Sequence[Mark | None]]) -> tuple[BoolArray, FloatArray]:
         """Return which marks are found, (c, p), and where, (c, p, 2) px; the middle of the image for the others."""
         middle = np.array([self._planned.width, self._planned.height]) / 2.0
-        pixels = [
-            [middle if mark is None else self._centre(mark, self._planned) for mark in row]
-            for row in marks
-        ]
-        return np.array([[mark is not None for mark in row] for row in marks]), np.array(pixels)
+        found = [[mark is not None for mark in row] for row in marks]
+        pixels = []
+        for row in marks:
+            centres = []
+            for mark in row:
+                centre = middle
+                if mark is not None:
+                    centre = self._centre(mark, self._planned)
+                centres.append(centre)
+            pixels.append(centres)
+        return np.array(found), np.array(pixels)
 
 
 @final
@@ -371,35 +395,35 @@ class BallCameras:
             raise ValueError(
                 f"sensing {name} needs the depth of {len(model.target)} points; only a ball's is measured"
             )
-        points, planned = (
-            _some_points(model.setup),
-            ideal_optics(model.planned, model.setup.cameras),
-        )
-        if (
-            model.setup.measure(points, model.optics) != model.setup.measure(points, planned)
-        ).any():
+        points = _some_points(model.setup)
+        planned = ideal_optics(model.planned, model.setup.cameras)
+        true_features = model.setup.measure(points, model.optics)
+        planned_features = model.setup.measure(points, planned)
+        if (true_features != planned_features).any():
             raise ValueError(
                 f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned"
             )
-        self._camera = DepthCamera(
-            scene, config, model.planned.reaching(model.distance), ball_radius
-        )
+        camera = model.planned.reaching(model.distance)
+        self._camera = DepthCamera(scene, config, camera, ball_radius)
 
     def find(
         self, model: SetupModel, q: FloatArray, noise: ImageNoise
     ) -> tuple[FloatArray, BoolArray]:
         """Return the ball in the frame of each camera, (c, 1, 3) m, and which cameras found it, (c, 1)."""
-        ball = model.target[0] if model.mount == "hand" else model.points(q)[0]
-        poses = enumerate(camera_poses(model, q))
-        balls = [self._camera.find(pose, ball, noise, number) for number, pose in poses]
-        points = np.array([[NOWHERE if ball is None else ball.centre] for ball in balls])
-        return points, np.array([[ball is not None] for ball in balls])
+        # Cameras on the hand look at a target in the world, others at the ball on the flange.
+        true_ball = model.target[0] if model.mount == "hand" else model.points(q)[0]
+        points = []
+        found = []
+        for number, pose in enumerate(camera_poses(model, q)):
+            ball = self._camera.find(pose, true_ball, noise, number)
+            found.append([ball is not None])
+            points.append([NOWHERE if ball is None else ball.centre])
+        return np.array(points), np.array(found)
 
     def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
         """Return the images of all cameras side by side, with the detected ball marked, (h, w, 3)."""
-        return np.concatenate(
-            [self._camera.picture(pose) for pose in camera_poses(model, q)], axis=1
-        )
+        images = [self._camera.picture(pose) for pose in camera_poses(model, q)]
+        return np.concatenate(images, axis=1)
 
 
 @final
@@ -426,13 +450,18 @@ class SetupDetector(Detector[SetupModel]):
 
     def why_missing(self, model: SetupModel, q: FloatArray, valid: BoolArray | None) -> str:
         """Return which features are missing, and where they would be."""
-        valid = np.zeros(model.setup.m, dtype=np.bool_) if valid is None else valid
-        names, true = np.array(model.setup.features)[~valid], model.feature(q)[~valid]
+        setup = model.setup
+        if valid is None:
+            valid = np.zeros(setup.m, dtype=np.bool_)
+        names = np.array(setup.features)[~valid]
+        true = model.feature(q)[~valid]
         wide, high = model.optics.size
-        clipped = model.planned.reaching(model.distance).clipping(model.point_motions(q)[0][..., 2])
+        camera = model.planned.reaching(model.distance)
+        points, *_ = model.point_motions(q)
+        clipped = camera.clipping(points[..., 2])
         return (
             f"{', '.join(names)} cannot be seen at the start {q.round(6).tolist()}: without anything in between they "
-            f"would be {true.round(1).tolist()} {model.setup.unit} in images of {wide:g} x {high:g}; the target is "
+            f"would be {true.round(1).tolist()} {setup.unit} in images of {wide:g} x {high:g}; the target is "
             f"{clipped}hidden, out of sight, too small or cut by the border"
         )
 
@@ -460,18 +489,19 @@ def open_detector(
 
 def needs_depth(setup: SensingSetup, optics: Optics) -> bool:
     """Return whether the features change when points move along the rays on which they are found."""
-    near = _some_points(setup)
-    return not np.allclose(
-        setup.measure(near, optics), setup.measure(2.0 * near, optics), rtol=1e-9, atol=1e-9
-    )
+    points = _some_points(setup)
+    near = setup.measure(points, optics)
+    far = setup.measure(2.0 * points, optics)
+    return not np.allclose(near, far, rtol=1e-9, atol=1e-9)
 
 
 def _some_points(setup: SensingSetup) -> FloatArray:
     """Return points (c, p, 3) m in front of all cameras, no two alike."""
     count = setup.cameras * len(setup.target)
-    points = np.stack(
-        [0.1 * np.sin(np.arange(count)), 0.1 * np.cos(np.arange(count)), np.ones(count)], axis=-1
-    )
+    angle = np.arange(count)
+    x = 0.1 * np.sin(angle)
+    y = 0.1 * np.cos(angle)
+    points = np.stack([x, y, np.ones(count)], axis=-1)
     return points.reshape(setup.cameras, len(setup.target), 3)
 
 
@@ -479,7 +509,8 @@ def camera_poses(model: SetupModel, q: FloatArray) -> FloatArray:
     """Return the cameras in the base frame, (c, 4, 4), with the arm at `q` (n,) rad."""
     if model.mount == "fixed":
         return model.cameras
-    return np.asarray(model.arm.frames(q)[-1] @ model.cameras)
+    flange = model.arm.frames(q)[-1]
+    return np.asarray(flange @ model.cameras)
 
 
 def depth_deviation(
@@ -489,7 +520,8 @@ def depth_deviation(
     z = np.asarray(depth, dtype=np.float64)
     if config.depth_noise == "stereo":
         native_focal = camera.focal * config.native_width / camera.width
-        return np.asarray(z**2 * (config.depth_subpixel / (native_focal * config.depth_baseline)))
+        slope = config.depth_subpixel / (native_focal * config.depth_baseline)  # [1/m]
+        return np.asarray(z**2 * slope)
     if config.depth_noise == "structured_light":
         return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2)
     return np.zeros_like(z)
@@ -515,9 +547,8 @@ def measure_depth(
     """
     z = depth
     if config.depth_noise != "none":
-        noise = _unit_noise(
-            config.depth_patch * camera.width / config.native_width, shape, generator
-        )
+        side = config.depth_patch * camera.width / config.native_width
+        noise = _unit_noise(side, shape, generator)
         deviation = config.sensing.noise_factor * depth_deviation(config, z, camera)
         z = z + deviation * noise[patch.rows, patch.columns]
     if config.depth_quantisation > 0.0:
@@ -528,10 +559,13 @@ def measure_depth(
 def _unit_noise(side: float, shape: tuple[int, int], generator: np.random.Generator) -> FloatArray:
     """Return noise of unit variance at all pixels of a window, (h, w), that match by patches of `side` px."""
     kernel = _patch_kernel(side)
+    # Noise beyond the window's border, too, so that pixels at the border have unit variance as well.
     margin = len(kernel) // 2
-    white = generator.standard_normal((shape[0] + 2 * margin, shape[1] + 2 * margin))
-    smooth = convolve1d(convolve1d(white, kernel, axis=0), kernel, axis=1)
-    return np.asarray(smooth[margin : margin + shape[0], margin : margin + shape[1]])
+    height, width = shape
+    white = generator.standard_normal((height + 2 * margin, width + 2 * margin))
+    by_rows = convolve1d(white, kernel, axis=0)
+    smooth = convolve1d(by_rows, kernel, axis=1)
+    return np.asarray(smooth[margin : margin + height, margin : margin + width])
 
 
 @cache
@@ -539,5 +573,7 @@ def _patch_kernel(side: float) -> FloatArray:
     """Return Gaussian weights, (odd,), of the second moment of a patch of `side` [px] whose squares sum to 1."""
     deviation = side / np.sqrt(12.0)
     reach = int(np.ceil(3.0 * deviation))
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(deviation, 1e-9)) ** 2)
+    pixels = np.arange(-reach, reach + 1)
+    standardised = pixels / max(deviation, 1e-9)
+    weights = np.exp(-0.5 * standardised**2)
     return np.asarray(weights / np.sqrt(weights @ weights))

@@ -16,6 +16,7 @@ direction of Σ w r / |r|⁴ over the rays r = (x/z, y/z, 1) through its pixels,
 that they cover, by the intrinsics that are planned.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -33,9 +34,7 @@ class MarkColour(NamedTuple):
     """The colour of a mark."""
 
     paint: Colour  # red, green, blue and opacity
-    hues: (
-        HueRange  # in which its pixels are, if OpenCV is fed with red, green, blue; no two overlap
-    )
+    hues: HueRange  # range of its pixels, if OpenCV is fed with red, green, blue; no two overlap
 
 
 MARK_COLOURS: Final = (
@@ -45,7 +44,7 @@ MARK_COLOURS: Final = (
     MarkColour((0.85, 0.05, 0.80, 1.0), ((139, 120, 40), (157, 255, 255))),  # magenta
 )
 EDGE = 1.0  # [px] how far the outline of a whole mark may be from its ellipse
-MIN_HALF_AXIS = 1.5  # [px] of the ellipse of a mark
+MIN_HALF_AXIS = 1.5  # [px] least half axis of the ellipse of a mark
 NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 ELLIPSE = 2.0  # standard deviations of a filled ellipse from its middle to its edge
 
@@ -55,7 +54,7 @@ class Mark(NamedTuple):
 
     rows: IntArray  # (k,) [px]
     columns: IntArray  # (k,) [px]
-    shares: FloatArray  # (k,), of each of them that the mark has
+    shares: FloatArray  # (k,) [1], the mark's share of each of these pixels
 
 
 def find_marks(
@@ -71,79 +70,116 @@ def find_marks(
     hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
     masks = [np.asarray(cv2.inRange(hsv, *colour.hues), dtype=np.uint8) for colour in colours]
     grown = [cv2.dilate(mask, NEIGHBOURS) for mask in masks]
+    top, left = corner
     found: list[Mark | None] = []
-    for number, mask in enumerate(masks):
-        patch, others = largest_patch(mask), grown[:number] + grown[number + 1 :]
-        whole = patch if patch is None or others or fills_ellipse(patch) else _hull(patch)
-        touched = patch is not None and any(
-            other[patch.rows, patch.columns].any() for other in others
-        )
-        if patch is None or whole is None or touched or not fills_ellipse(whole):
+    for number, colour in enumerate(colours):
+        patch = largest_patch(masks[number])
+        others = grown[:number] + grown[number + 1 :]
+        whole = _whole_mark(patch, others)
+        if patch is None or whole is None:
             found.append(None)
-        else:
-            mark = _with_shares(patch, whole, rgb, colours[number].paint)
-            found.append(
-                mark._replace(rows=mark.rows + corner[0], columns=mark.columns + corner[1])
-            )
+            continue
+        mark = _with_shares(patch, whole, rgb, colour.paint)
+        found.append(mark._replace(rows=mark.rows + top, columns=mark.columns + left))
     return found
+
+
+def _whole_mark(patch: Patch | None, others: Sequence[cv2.typing.MatLike]) -> Patch | None:
+    """Return all pixels of a mark, those of a ball's notch included; None where it is not wholly visible.
+
+    Args:
+        patch: the pixels of its colour, or None.
+        others: masks (h, w) of the other marks and their neighbours. A mark without any is a ball.
+    """
+    if patch is None:
+        return None
+    if any(other[patch.rows, patch.columns].any() for other in others):
+        return None
+    if fills_ellipse(patch):
+        return patch
+    if others:
+        return None
+    hull = _hull(patch)
+    return hull if fills_ellipse(hull) else None
 
 
 def _hull(patch: Patch) -> Patch:
     """Return the pixels of the convex hull of a patch."""
-    corner = np.array([patch.columns.min(), patch.rows.min()])
-    points = (np.stack([patch.columns, patch.rows], axis=-1) - corner).astype(np.int32)
-    box = np.zeros(points.max(axis=0)[::-1] + 1, dtype=np.uint8)
-    rows, columns = np.nonzero(cv2.fillConvexPoly(box, cv2.convexHull(points), 1))
-    return Patch(rows + corner[1], columns + corner[0])
+    left = patch.columns.min()
+    top = patch.rows.min()
+    points = np.stack([patch.columns - left, patch.rows - top], axis=-1).astype(np.int32)
+    width, height = points.max(axis=0) + 1
+    box = np.zeros((height, width), dtype=np.uint8)
+    filled = cv2.fillConvexPoly(box, cv2.convexHull(points), 1)
+    rows, columns = np.nonzero(filled)
+    return Patch(rows + top, columns + left)
 
 
 def fills_ellipse(patch: Patch) -> bool:
     """Return whether pixels fill an ellipse and nothing else, to within `EDGE`."""
     x = np.stack([patch.columns, patch.rows], axis=-1).astype(np.float64)
     middle = x.mean(axis=0)
-    sizes, axes = np.linalg.eigh(np.cov(x.T, bias=True))
-    half = ELLIPSE * np.sqrt(np.maximum(sizes, 0.0))
-    if half[0] < MIN_HALF_AXIS:
+    variances, axes = np.linalg.eigh(np.cov(x.T, bias=True))
+    half_axes = ELLIPSE * np.sqrt(np.maximum(variances, 0.0))
+    if half_axes[0] < MIN_HALF_AXIS:
         return False
-    lower = np.array([patch.columns.min(), patch.rows.min()])
-    width, height = np.array([patch.columns.max(), patch.rows.max()]) - lower + 1
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + lower
-    inner = (((grid - middle) @ axes / (half - EDGE).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
-    outer = (((grid - middle) @ axes / (half + EDGE)) ** 2).sum(axis=-1) <= 1.0
+    left = patch.columns.min()
+    top = patch.rows.min()
+    width = patch.columns.max() - left + 1
+    height = patch.rows.max() - top + 1
     filled = np.zeros((height, width), dtype=np.bool_)
-    filled[patch.rows - lower[1], patch.columns - lower[0]] = True
-    return bool((filled | ~inner).all() and (outer | ~filled).all())
+    filled[patch.rows - top, patch.columns - left] = True
+    # Pixels of the patch's box along the axes of its ellipse.
+    box = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    along_axes = (box + np.array([left, top]) - middle) @ axes
+    inner = ((along_axes / (half_axes - EDGE).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
+    outer = ((along_axes / (half_axes + EDGE)) ** 2).sum(axis=-1) <= 1.0
+    covers_inner = (filled | ~inner).all()
+    within_outer = (outer | ~filled).all()
+    return bool(covers_inner and within_outer)
 
 
 def _with_shares(patch: Patch, whole: Patch, rgb: ByteArray, paint: Colour) -> Mark:
     """Return the mark of a patch, with its share of each pixel of the whole mark and of their neighbours."""
-    top, left = patch.rows.min() - 1, patch.columns.min() - 1
-    box = rgb[top : patch.rows.max() + 2, left : patch.columns.max() + 2, :3].astype(np.float64)
-    towards = np.array(paint[:3]) - np.mean(paint[:3])
-    amount = np.maximum((box - box.mean(axis=-1, keepdims=True)) @ towards, 0.0)
-    near = np.zeros(amount.shape, dtype=np.uint8)
-    near[whole.rows - top, whole.columns - left] = 1
-    rows, columns = np.nonzero(cv2.dilate(near, NEIGHBOURS))
-    shares = amount / np.maximum(np.asarray(cv2.dilate(amount, NEIGHBOURS)), 1e-9)
-    inner = cv2.erode(near, NEIGHBOURS)
-    inner[patch.rows - top, patch.columns - left] = 0
-    shares[(cv2.dilate(inner, NEIGHBOURS) & near) > 0] = 1.0
+    # The box has a border of one pixel for the neighbours; no patch touches the border of the image.
+    top = patch.rows.min() - 1
+    left = patch.columns.min() - 1
+    bottom = patch.rows.max() + 2
+    right = patch.columns.max() + 2
+    colour = rgb[top:bottom, left:right, :3].astype(np.float64)
+    grey = colour.mean(axis=-1, keepdims=True)
+    towards_paint = np.array(paint[:3]) - np.mean(paint[:3])
+    amount = np.maximum((colour - grey) @ towards_paint, 0.0)
+    largest = np.asarray(cv2.dilate(amount, NEIGHBOURS))
+    shares = amount / np.maximum(largest, 1e-9)
+    in_mark = np.zeros(amount.shape, dtype=np.uint8)
+    in_mark[whole.rows - top, whole.columns - left] = 1
+    # Pixels of a notch, away from the edge, belong to the mark as a whole, and so do their neighbours within it.
+    notch = cv2.erode(in_mark, NEIGHBOURS)
+    notch[patch.rows - top, patch.columns - left] = 0
+    about_notch = (cv2.dilate(notch, NEIGHBOURS) & in_mark) > 0
+    shares[about_notch] = 1.0
+    rows, columns = np.nonzero(cv2.dilate(in_mark, NEIGHBOURS))
     return Mark(rows + top, columns + left, shares[rows, columns])
 
 
 def disc_centre(mark: Mark, camera: PinholeCamera) -> FloatArray:
     """Return where the middle of a disc appears, (2,) px from the image's upper left corner."""
-    return _in_image(mark.shares @ camera.rays(mark.columns, mark.rows), camera)
+    rays = camera.rays(mark.columns, mark.rows)
+    return _in_image(mark.shares @ rays, camera)
 
 
 def sphere_centre(mark: Mark, camera: PinholeCamera) -> FloatArray:
     """Return where the centre of a sphere appears, (2,) px from the image's upper left corner."""
     rays = camera.rays(mark.columns, mark.rows)
     length2 = np.vecdot(rays, rays)
-    return _in_image((mark.shares / (length2 * length2)) @ rays, camera)
+    weights = mark.shares / (length2 * length2)
+    return _in_image(weights @ rays, camera)
 
 
 def _in_image(direction: FloatArray, camera: PinholeCamera) -> FloatArray:
     """Return where a direction (3,) appears, (2,) px."""
-    half = np.array([camera.width, camera.height]) / 2.0
-    return np.asarray(half + camera.focal * direction[:2] / direction[2])
+    x, y, z = direction
+    u = camera.width / 2.0 + camera.focal * x / z
+    v = camera.height / 2.0 + camera.focal * y / z
+    return np.array([u, v])
