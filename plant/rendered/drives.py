@@ -28,8 +28,9 @@ from servobench.plant.rendered.settings import DriveConfig
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 Arrays: TypeAlias = tuple[FloatArray, ...]
 PHYSICS_STEP = 0.001  # [s] where it divides the time to simulate, which otherwise has equal steps that are not longer
-# [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
-POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
+# Bandwidths of the outer loops over that of the velocity loop: the poles stay damped at twice the inertia.
+POSITION_SHARE = 0.25  # [1]
+INTEGRAL_SHARE = 0.1  # [1]
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
 MAX_FOLLOWING_ERROR = 0.1  # [rad] the reference waits for a joint that falls behind further
 
@@ -61,10 +62,10 @@ class InPlace:
         self._arrays = *arguments, *results  # The function keeps pointers to these arrays.
         self._buffer: Any
         self._buffer, self._evaluate = function.buffer()
-        for i, array in enumerate(arguments):
-            self._buffer.set_arg(i, array.data)
-        for i, array in enumerate(results):
-            self._buffer.set_res(i, array.data)
+        for position, array in enumerate(arguments):
+            self._buffer.set_arg(position, array.data)
+        for position, array in enumerate(results):
+            self._buffer.set_res(position, array.data)
 
     def __call__(self) -> None:
         """Evaluate the function."""
@@ -110,28 +111,35 @@ class Drives:
         h = self._h = physics_step
         config.check(n)
         self._lower, self._upper = stops
-        blend = np.array([-math.expm1(-h / lag) if lag > 0.0 else 1.0])
+        blend = np.ones(1)  # [1] 1 − e^(−h/τ)
+        if lag > 0.0:
+            blend[0] = -math.expm1(-h / lag)
         rotor = np.broadcast_to(config.rotor_inertia, n)
         pole = 2 * np.pi * np.broadcast_to(config.velocity_bandwidth, n)
         self._velocity_gain = pole * (np.diagonal(assumed_inertia) + rotor)
         self._position_gain = POSITION_SHARE * pole
         self._integral_gain = h * INTEGRAL_SHARE * pole * self._velocity_gain
         self._diagonal = np.diag_indices(n)
-        self._rotor, self._limit = np.diag(rotor), np.broadcast_to(config.torque_limit, n)
+        self._rotor = np.diag(rotor)
+        self._limit = np.broadcast_to(config.torque_limit, n)
         self._compensation = config.friction_compensation / h
         self._viscous = h * np.broadcast_to(config.viscous_friction, n)
         self._coulomb = h * np.broadcast_to(config.coulomb_friction, n)
-        self.angle, self.speed, self.assumed_gravity = body or (
-            np.zeros(n),
-            np.zeros(n),
-            np.zeros(n),
-        )
-        self.command, self.torque, self.drag = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._loops, self._next = np.zeros((3, n)), np.zeros((3, n))
-        moved = blend, self.command, self._loops.ravel()
-        self._follow = InPlace(self._reference_law(n), moved, (self._next.ravel(),))
-        arguments = *moved, self.angle, self.speed, self.assumed_gravity
-        self._step = InPlace(self._law(n), arguments, (self._next.ravel(), self.torque, self.drag))
+        own = (np.zeros(n), np.zeros(n), np.zeros(n))
+        self.angle, self.speed, self.assumed_gravity = body or own
+        self.command = np.zeros(n)
+        self.torque = np.zeros(n)
+        self.drag = np.zeros(n)
+        # Rows of the loops: r, c, z. CasADi writes the next ones beside them: no result shares an argument's memory.
+        self._loops = np.zeros((3, n))
+        self._next = np.zeros((3, n))
+        loops = self._loops.ravel()
+        next_loops = self._next.ravel()
+        commanded = (blend, self.command, loops)
+        self._follow = InPlace(self._reference_law(n), commanded, (next_loops,))
+        arguments = (*commanded, self.angle, self.speed, self.assumed_gravity)
+        results = (next_loops, self.torque, self.drag)
+        self._step = InPlace(self._law(n), arguments, results)
 
     def start(self, angle: FloatArray, body: RigidBody) -> DriveState:
         """Return joints at rest at `angle` (n,) [rad] whose integrals carry the rest of the gravity."""
@@ -140,8 +148,10 @@ class Drives:
 
     def take(self, state: DriveState, command: FloatArray) -> None:
         """Set the state of joints and loops, and the command (n,) [rad/s]."""
-        self.command[:], self.angle[:], self.speed[:] = command, state.angle, state.speed
-        self._loops[:] = state.reference, state.reference_speed, state.integral
+        self.command[:] = command
+        self.angle[:] = state.angle
+        self.speed[:] = state.speed
+        self._loops[:] = (state.reference, state.reference_speed, state.integral)
 
     def give(self) -> DriveState:
         """Return the present state, as arrays that never change."""
@@ -169,21 +179,23 @@ class Drives:
         self.assumed_gravity[:] = body.assumed_gravity
         self.step()
         h = self._h
+        # Friction is implicit: it stands with the inertia on the left of (M + I + drag) ω₊ = momentum.
         inertia = body.inertia + self._rotor
         momentum = inertia @ self.speed + h * (self.torque - body.bias)
         inertia[self._diagonal] += self.drag
-        speed = dposv(inertia, momentum)[1]
+        _, speed, _ = dposv(inertia, momentum)
         moved = self.angle + h * speed
         self.angle[:] = np.minimum(np.maximum(moved, self._lower), self._upper)
+        # A joint at its stop rests.
         self.speed[:] = np.where(self.angle == moved, speed, 0.0)
 
     def _reference_law(self, n: int) -> casadi.Function:
         """Return (blend, u, loops) -> loops with the reference one physics step later."""
-        arguments = blend, u, loops = _symbols(blend=1, u=n, loops=3 * n)
+        arguments = _symbols(blend=1, u=n, loops=3 * n)
+        blend, u, loops = arguments
         r, c, z = casadi.vertsplit(loops, n)
-        return casadi.Function(
-            "reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)]
-        )
+        r, c = self._followed(blend, u, r, c)
+        return casadi.Function("reference", arguments, [casadi.vertcat(r, c, z)])
 
     def _law(self, n: int) -> casadi.Function:
         """Return (blend, u, loops, θ, ω, ĝ) -> loops a physics step later, torque and drag for this step."""
@@ -191,14 +203,16 @@ class Drives:
         blend, u, loops, theta, omega, gravity = arguments
         r, c, z = casadi.vertsplit(loops, n)
         r, c = self._followed(blend, u, r, c)
-        behind = casadi.fmin(casadi.fmax(r - theta, -MAX_FOLLOWING_ERROR), MAX_FOLLOWING_ERROR)
-        e = c + self._position_gain * behind - omega
+        following_error = _clip(r - theta, MAX_FOLLOWING_ERROR)
+        e = c + self._position_gain * following_error - omega
         friction = self._compensation * self._drag(c) * c
-        asked = self._velocity_gain * e + z + gravity + friction
-        torque = casadi.fmin(casadi.fmax(asked, -self._limit), self._limit)
-        z = z + self._integral_gain * e * (asked == torque)
-        after = casadi.vertcat(theta + behind, c, z)
-        return casadi.Function("step", arguments, [after, torque, self._drag(omega)])
+        wanted_torque = self._velocity_gain * e + z + gravity + friction
+        torque = _clip(wanted_torque, self._limit)
+        # The integral waits while the torque is clipped.
+        z = z + self._integral_gain * e * (wanted_torque == torque)
+        # The reference waits for a joint that falls behind further than the largest following error.
+        next_loops = casadi.vertcat(theta + following_error, c, z)
+        return casadi.Function("step", arguments, [next_loops, torque, self._drag(omega)])
 
     def _followed(self, blend: SX, u: SX, r: SX, c: SX) -> tuple[SX, SX]:
         """Return the reference r and its speed c one physics step later, limited to the stops.
@@ -213,6 +227,11 @@ class Drives:
     def _drag(self, speed: SX) -> SX:
         """Return friction over speed, times the physics step."""
         return self._viscous + self._coulomb / casadi.fmax(casadi.fabs(speed), STICKING_SPEED)
+
+
+def _clip(value: SX, limit: float | FloatArray) -> SX:
+    """Return a value limited to ± limit."""
+    return casadi.fmin(casadi.fmax(value, -limit), limit)
 
 
 def _symbols(**sizes: int) -> list[SX]:

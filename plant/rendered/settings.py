@@ -65,17 +65,16 @@ class DriveConfig:
         Raises:
             ValueError: a list of another length.
         """
-        for name in (
-            "velocity_bandwidth",
-            "torque_limit",
-            "rotor_inertia",
-            "coulomb_friction",
-            "viscous_friction",
-        ):
-            if len(getattr(self, name)) not in {1, n}:
-                raise ValueError(
-                    f"{name} must have 1 or {n} numbers, got {len(getattr(self, name))}"
-                )
+        lists = {
+            "velocity_bandwidth": self.velocity_bandwidth,
+            "torque_limit": self.torque_limit,
+            "rotor_inertia": self.rotor_inertia,
+            "coulomb_friction": self.coulomb_friction,
+            "viscous_friction": self.viscous_friction,
+        }
+        for name, values in lists.items():
+            if len(values) not in {1, n}:
+                raise ValueError(f"{name} must have 1 or {n} numbers, got {len(values)}")
 
 
 def drives_for(robot: Robot) -> DriveConfig:
@@ -83,19 +82,24 @@ def drives_for(robot: Robot) -> DriveConfig:
 
     Joints of at least half the torque of the strongest one have the bandwidth of a shoulder, the others of a wrist.
     """
-    own, default = robot.links.torque, DriveConfig()
-    share = own / ur5.MAX_TORQUE[0]
-    friction = default.coulomb_friction[0] * share
-    slow, fast = default.velocity_bandwidth[0], default.velocity_bandwidth[-1]
-    load = robot.links.payload / RATED_PAYLOAD
+    default = DriveConfig()
+    torque = robot.links.torque
+    strong = torque >= torque.max() / 2.0
+    shoulder = default.velocity_bandwidth[0]
+    wrist = default.velocity_bandwidth[-1]
+    bandwidth = np.where(strong, shoulder, wrist)
+    torque_ratio = torque / ur5.MAX_TORQUE[0]
+    rotor_inertia = default.rotor_inertia[0] * float(torque_ratio.max())
+    friction = tuple((default.coulomb_friction[0] * torque_ratio).tolist())
+    load_ratio = robot.links.payload / RATED_PAYLOAD
     return DriveConfig(
-        velocity_bandwidth=tuple(np.where(own >= own.max() / 2.0, slow, fast).tolist()),
-        torque_limit=tuple(own.tolist()),
-        rotor_inertia=(default.rotor_inertia[0] * float(share.max()),),
-        coulomb_friction=tuple(friction.tolist()),
-        viscous_friction=tuple(friction.tolist()),
-        payload=default.payload * load,
-        assumed_payload=default.assumed_payload * load,
+        velocity_bandwidth=tuple(bandwidth.tolist()),
+        torque_limit=tuple(torque.tolist()),
+        rotor_inertia=(rotor_inertia,),
+        coulomb_friction=friction,
+        viscous_friction=friction,
+        payload=default.payload * load_ratio,
+        assumed_payload=default.assumed_payload * load_ratio,
     )
 
 
@@ -144,12 +148,14 @@ class RenderedConfig:
 
     def boxes(self) -> tuple[Box, ...]:
         """Return the obstacles."""
-        boxes = enumerate(self.obstacles, 1)
-        return tuple(
-            Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in boxes
-        )
+        boxes = []
+        for number, (x, y, z, dx, dy, dz) in enumerate(self.obstacles, 1):
+            boxes.append(Box(f"obstacle {number}", (x, y, z), (dx, dy, dz)))
+        return tuple(boxes)
 
 
 def rendered_config(robot: Robot) -> RenderedConfig:
     """Return the default settings for a robot: drives and load in proportion to its own."""
-    return RenderedConfig() if robot.name == ur5.UR5 else RenderedConfig(drives=drives_for(robot))
+    if robot.name == ur5.UR5:
+        return RenderedConfig()
+    return RenderedConfig(drives=drives_for(robot))

@@ -31,9 +31,8 @@ from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
-CONTACT_STEPS = (
-    10  # physics steps between two checks for contact, 10 mm at 1 m/s; and at the end of a period
-)
+# Physics steps between two checks for contact, 10 mm at 1 m/s; the end of a period is checked, too.
+CONTACT_STEPS = 10
 LAST_ON_TABLE = 1  # base and shoulder stand on the table
 # Base and upper arm, whose housings meet inside the shoulder in every pose.
 BUILT_INTO_EACH_OTHER: set[int | str] = {0, 2}
@@ -57,7 +56,8 @@ class Contacts:
             robot: by its maker's description; its home is free of contact.
             config: whether contact counts.
         """
-        self._room, self._own = config.room_contact, config.self_contact
+        self._room = config.room_contact
+        self._own = config.self_contact
         self._overlaps = overlaps
         self._names = ["base", *arm.joint_names]
         self._built_in = [BUILT_INTO_EACH_OTHER]
@@ -66,7 +66,9 @@ class Contacts:
 
     def find(self, angle: FloatArray) -> tuple[str, str] | None:
         """Return the names of two bodies whose contact counts at joint angles (n,) [rad], or None."""
-        for link, other in self._overlaps(angle) if self._room or self._own else ():
+        if not self._room and not self._own:
+            return None
+        for link, other in self._overlaps(angle):
             if isinstance(other, str):
                 if self._room and link > LAST_ON_TABLE:
                     return self._names[link], other
@@ -99,17 +101,17 @@ class RenderedWorld(World):
         if robot.flaw:
             raise ValueError(f"robot {robot.name}: {robot.flaw}")
         model, start = setup.robot()
-        self._config, self._model, arm = config, model, model.arm
+        arm = model.arm
+        self._config = config
+        self._model = model
         self.lag = config.lag
         self.spec = hand_eye_spec(
             model, setup.period, config.max_joint_speed, config.joint_range, setup.limits
         )
-        sensing = config.sensing
-        if (
-            any(sensing.extents(self.spec.feature.unit)[each] for each in (0, 2))
-            or sensing.outliers > 0.0
-        ):
-            self.noise_unit = model.noise_unit  # without noise, features keep their bits
+        extents = config.sensing.extents(self.spec.feature.unit)
+        # Without noise, features keep their bits.
+        if extents.feature_noise or extents.quantum or config.sensing.outliers > 0.0:
+            self.noise_unit = model.noise_unit
         self._start = as_array("start", start, (self.spec.n,))
         self._steps = fewest_parts(setup.period, PHYSICS_STEP)
         self._physics_step = PHYSICS_STEP
@@ -120,17 +122,24 @@ class RenderedWorld(World):
         self._camera = model.camera
         self._valid: BoolArray | None = None
         boxes = config.boxes()
-        room = Room(
-            arm, config.scenery, robot, boxes, model if isinstance(model, SetupModel) else None
-        )
+        target = model if isinstance(model, SetupModel) else None
+        room = Room(arm, config.scenery, robot, boxes, target)
         self._scene = engine.scene(room, window=config.view)
-        stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
-        ordered = np.minimum(*stops), np.maximum(*stops)
-        angle = arm.joint_angle(self._start)
+        # A negative gear ratio makes the lower stop of a joint position the upper one of its angle.
+        one_stop = arm.joint_angle(self.spec.joint_lower)
+        other_stop = arm.joint_angle(self.spec.joint_upper)
+        stops = (np.minimum(one_stop, other_stop), np.maximum(one_stop, other_stop))
         try:
             self._detector = open_detector(model, self._scene, config, robot)
             machine = Machine(
-                arm, robot, boxes, config.drives, config.lag, angle, ordered, self._physics_step
+                arm=arm,
+                robot=robot,
+                boxes=boxes,
+                drives=config.drives,
+                lag=config.lag,
+                start=arm.joint_angle(self._start),
+                stops=stops,
+                physics_step=self._physics_step,
             )
             self._simulation = engine.simulation(machine)
         except BaseException:
@@ -173,9 +182,8 @@ class RenderedWorld(World):
         self._periods += 1
         if self._config.view:
             # The window shows the run at the pace of the wall clock.
-            time.sleep(
-                max(0.0, self._started + self._periods * self.spec.period - time.perf_counter())
-            )
+            end = self._started + self._periods * self.spec.period
+            time.sleep(max(0.0, end - time.perf_counter()))
         return self._reported()
 
     def _check_contact(self, step: int) -> None:
@@ -206,7 +214,8 @@ class RenderedWorld(World):
 
     def restore(self, state: RenderedState) -> None:
         """See `Plant.restore`."""
-        self._joints, self._periods = state.joints, state.periods
+        self._joints = state.joints
+        self._periods = state.periods
         self._scene.place(state.joints.angle)
         self.move_camera(state.camera)
         self._noise = state.noise
@@ -235,9 +244,13 @@ class RenderedWorld(World):
 
     def _reported(self) -> FloatArray:
         """Return the joint positions in steps of the encoders, (n,) rad; the scale ends at the stops."""
-        q, resolution = self._joint_position(), self._config.encoder_resolution
+        q = self._joint_position()
+        resolution = self._config.encoder_resolution
         if resolution == 0.0:
             return q
-        lower, upper, half = self.spec.joint_lower, self.spec.joint_upper, resolution / 2.0
-        steps = np.where(q >= upper - half, upper, np.round(q / resolution) * resolution)
-        return np.where(q <= lower + half, lower, steps)
+        half = resolution / 2.0
+        lower = self.spec.joint_lower
+        upper = self.spec.joint_upper
+        steps = np.round(q / resolution) * resolution
+        below_upper = np.where(q >= upper - half, upper, steps)
+        return np.where(q <= lower + half, lower, below_upper)
