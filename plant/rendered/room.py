@@ -21,7 +21,7 @@ from servobench.plant.robot.robot import Robot
 
 WHITE: Final = (0.97, 0.97, 0.97, 1.0)
 DISC_RADIUS: Final = 0.02  # [m] for a UR5
-PAD_RADIUS: Final = 0.035  # [m] of the white pad behind a disc, for a UR5
+PAD_RADIUS: Final = 0.035  # [m] radius of the white pad behind a disc, for a UR5
 LAYER: Final = 0.001  # [m] thickness of discs and pads, for a UR5
 ROD_RADIUS: Final = 0.004  # [m] for a UR5
 # [m] Radius and length of a camera on the hand, for a UR5; too near to be in its own image.
@@ -39,9 +39,8 @@ class Room:
     scenery: bool  # whether the table and the floor are there
     robot: Robot  # by its maker's description, for the visual shapes
     boxes: tuple[Box, ...] = ()  # obstacles
-    model: SetupModel | None = (
-        None  # target and cameras of a sensing set-up; None for the ball on the flange
-    )
+    # Target and cameras of a sensing set-up; None for the ball on the flange.
+    model: SetupModel | None = None
 
     def files(self) -> dict[str, str]:
         """Return the files, text by name: a URDF for each body, that of the arm first, and the meshes they name.
@@ -58,40 +57,43 @@ class Room:
 
     def _own_files(self) -> dict[str, str]:
         """Return the files of the arm with its target or cameras, and of a target in the world."""
-        tree, model = urdf.arm_tree(self.arm, self.robot), self.model
-        if model is None or (
-            model.mount == "fixed" and len(model.target) == 1
-        ):  # the ball, which every arm carries
+        tree = urdf.arm_tree(self.arm, self.robot)
+        model = self.model
+        if model is None:
             return {"arm.urdf": urdf.text(tree)}
+        fixed = model.mount == "fixed"
+        if fixed and len(model.target) == 1:  # the ball, which every arm carries
+            return {"arm.urdf": urdf.text(tree)}
+        # The flange carries the plate or the cameras in the place of the ball.
         (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
         for visual in carried.findall("visual"):
             carried.remove(visual)
-        if model.mount == "fixed":
+        if fixed:
             self._draw_target(carried, model, -self.arm.tool)
             return {"arm.urdf": urdf.text(tree)}
         radius, length = target_scale(model, self.robot) * np.array(HOUSING)
         for pose in model.cameras:
             lens = pose[:3, 3] - self.arm.tool
-            urdf.draw_cylinder(carried, urdf.DARK_GREY, lens - length * pose[:3, 2], lens, radius)
-        body, middle = ET.Element("robot", name="target"), model.target.mean(axis=0)
+            back = lens - length * pose[:3, 2]
+            urdf.draw_cylinder(carried, urdf.DARK_GREY, back, lens, radius)
+        body = ET.Element("robot", name="target")
         urdf.add_link(body, "world", *urdf.BASE_PART)
-        self._draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), model, -middle)
-        urdf.add_joint(
-            body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False
-        )
+        middle = model.target.mean(axis=0)
+        target = urdf.add_link(body, "target", *urdf.BASE_PART)
+        self._draw_target(target, model, -middle)
+        origin = np.stack([middle, np.zeros(3)])
+        urdf.add_joint(body, "place", ("world", "target"), origin, turns=False)
         return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
 
     def _draw_target(self, link: ET.Element, model: SetupModel, shift: FloatArray) -> None:
         """Draw ball or plate, the points of which are shifted by (3,) [m] into a link's frame."""
-        points, scale = model.target + shift, target_scale(model, self.robot)
+        points = model.target + shift
         if len(points) == 1:
             urdf.draw_mesh(link, RED, urdf.BALL_MESH, self.robot.workspace.ball_radius)
             return
-        normal = (
-            np.cross(points[1] - points[0], points[2] - points[0])
-            if len(points) > 2
-            else np.zeros(3)
-        )
+        normal = np.zeros(3)
+        if len(points) > 2:
+            normal = np.cross(points[1] - points[0], points[2] - points[0])
         length = np.linalg.norm(normal)
         if len(points) > len(MARK_COLOURS) or not length > 1e-9:
             wanted = (
@@ -99,24 +101,27 @@ class Room:
             )
             came = f"sensing {model.setup.name} has a target of {len(points)} points"
             raise ValueError(f"{came}; only these can be drawn: {wanted}")
-        # Away from the side of the discs
-        back, middle = (LAYER * scale * (normal / length), points.mean(axis=0))
+        scale = target_scale(model, self.robot)
+        # One layer away from the side of the discs: first discs, then pads, then the rods from the middle.
+        back = LAYER * scale * (normal / length)
+        hub = points.mean(axis=0) + 6.0 * back
         for point, colour in zip(points, MARK_COLOURS, strict=False):
-            urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
-            urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
-            urdf.draw_cylinder(
-                link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale
-            )
+            behind_disc = point + back
+            behind_pad = point + 2.0 * back
+            rod_end = point + 6.0 * back
+            urdf.draw_cylinder(link, colour.paint, point, behind_disc, DISC_RADIUS * scale)
+            urdf.draw_cylinder(link, WHITE, behind_disc, behind_pad, PAD_RADIUS * scale)
+            urdf.draw_cylinder(link, urdf.DARK_GREY, hub, rod_end, ROD_RADIUS * scale)
 
 
 def target_scale(model: SetupModel, robot: Robot) -> float:
     """Return the scale of all lengths of a target and its cameras, over those of a UR5's bench."""
-    side = None if robot.camera is None else robot.camera.keys.target.side
-    return (
-        robot.workspace.scale
-        if side is None or len(model.target) == 1
-        else side / (2.0 * HALF_SIDE)
-    )
+    if robot.camera is None or len(model.target) == 1:
+        return robot.workspace.scale
+    side = robot.camera.keys.target.side
+    if side is None:
+        return robot.workspace.scale
+    return side / (2.0 * HALF_SIDE)
 
 
 def mark_radius(model: SetupModel, robot: Robot) -> float:
@@ -138,29 +143,34 @@ class Overview:
         """Return the overview of an arm.
 
         Args:
-            scale: of its workspace, over that of a UR5.
+            scale: size of its workspace, over that of a UR5's.
             fineness: pixels for one pixel of `OVERVIEW_CAMERA`, along each side; above 1 edges become smooth once
                 scaled down.
         """
-        width, height = (
-            round(fineness * side) for side in (OVERVIEW_CAMERA.width, OVERVIEW_CAMERA.height)
-        )
-        pose = _look_at(scale * np.array(OVERVIEW_POSITION), scale * np.array(OVERVIEW_TARGET))
-        distance = scale * float(np.linalg.norm(np.subtract(OVERVIEW_POSITION, OVERVIEW_TARGET)))
-        return cls(replace(OVERVIEW_CAMERA.reaching(distance), width=width, height=height), pose)
+        position = np.array(OVERVIEW_POSITION)
+        target = np.array(OVERVIEW_TARGET)
+        pose = _look_at(scale * position, scale * target)
+        distance = scale * float(np.linalg.norm(position - target))
+        width = round(fineness * OVERVIEW_CAMERA.width)
+        height = round(fineness * OVERVIEW_CAMERA.height)
+        camera = replace(OVERVIEW_CAMERA.reaching(distance), width=width, height=height)
+        return cls(camera, pose)
 
     def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points (k, 3) m of the base frame appear, (k, 2) px, and their depths, (k,) m."""
-        p_C = (points - self.X_BC[:3, 3]) @ self.X_BC[:3, :3]
+        R_BC = self.X_BC[:3, :3]
+        p_C = (points - self.X_BC[:3, 3]) @ R_BC
         return self.camera.project(p_C), p_C[:, 2]
 
 
 def _look_at(position: FloatArray, target: FloatArray) -> FloatArray:
     """Return X_BC, (4, 4), of a camera at `position` directed at `target`, both (3,) m, with the horizon level."""
-    z = (target - position) / np.linalg.norm(target - position)
+    towards = target - position
+    z = towards / np.linalg.norm(towards)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
+    y = np.cross(z, x)
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
+    pose[:3, :3] = np.stack([x, y, z], axis=-1)
     pose[:3, 3] = position
     return pose

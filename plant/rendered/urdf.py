@@ -18,24 +18,31 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.marks import RED, Colour
 from servobench.plant.rendered.settings import Box
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.camera import IntArray
 from servobench.plant.robot.robot import Robot
 
-BASE_LINK, FLANGE_LINK, BALL_LINK = "base", "flange", "ball"
+BASE_LINK = "base"
+FLANGE_LINK = "flange"
+BALL_LINK = "ball"
 ALUMINIUM = (0.76, 0.78, 0.80, 1.0)
 DARK_GREY = (0.26, 0.28, 0.31, 1.0)
 LIGHT_BLUE = (0.42, 0.66, 0.86, 1.0)
 TABLE_TOP = (0.86, 0.85, 0.82, 1.0)
 TABLE_RIM = (0.48, 0.50, 0.53, 1.0)
-FLOOR_A, FLOOR_B = (0.55, 0.59, 0.63, 1.0), (0.51, 0.55, 0.59, 1.0)
+FLOOR_A = (0.55, 0.59, 0.63, 1.0)
+FLOOR_B = (0.51, 0.55, 0.59, 1.0)
 TABLE = (-0.32, -0.75, 1.15, 0.75)  # [m] x and y of two opposite corners
 TABLE_THICKNESS = 0.04  # [m] of its top as an obstacle
-FLOOR_DROP, TILE = 0.75, 0.4  # [m] floor below the table's top; side of a floor tile
+FLOOR_DROP = 0.75  # [m] floor below the table's top
+TILE = 0.4  # [m] side of a floor tile
+RIM = 0.02  # [m] width of the table's rim
 LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBullet's default is 1 kg
 BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
 BALL_MESH = "ball.obj"  # file of the unit sphere in URDFs
-# Halves of the sides of the golden rectangles of an icosahedron
+# Halves of the sides of the golden rectangles whose corners are the vertices of an icosahedron.
 EDGES = (0.5257311121191336, 0.85065080835204)
-TRIANGLES = "0b5 051 017 07a 0ab 159 5b4 ba2 a76 718 394 342 326 368 389 495 24b 62a 867 981"  # by its vertices
+# Its triangles, each by its three vertices in hexadecimal digits.
+TRIANGLES = "0b5 051 017 07a 0ab 159 5b4 ba2 a76 718 394 342 326 368 389 495 24b 62a 867 981"
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 
 
@@ -123,9 +130,8 @@ def add_visual(
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=numbers(xyz), rpy=numbers(rpy))
     # PyBullet keeps materials by name, so every colour needs a name of its own.
-    material = ET.SubElement(
-        visual, "material", name="rgba_" + "_".join(f"{255 * part:.0f}" for part in colour)
-    )
+    name = "rgba_" + "_".join(f"{255 * part:.0f}" for part in colour)
+    material = ET.SubElement(visual, "material", name=name)
     ET.SubElement(material, "color", rgba=numbers(colour))
     return ET.SubElement(visual, "geometry")
 
@@ -134,11 +140,14 @@ def draw_cylinder(
     link: ET.Element, colour: Colour, start: npt.ArrayLike, end: npt.ArrayLike, radius: float
 ) -> None:
     """Draw a cylinder between two points (3,) m of the body frame; nothing where they coincide."""
-    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    a = np.asarray(start, dtype=np.float64)
+    b = np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(b - a))
-    if length > 1e-6:
-        geometry = add_visual(link, colour, (a + b) / 2, rpy_along(b - a))
-        ET.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(length))
+    if length <= 1e-6:
+        return
+    middle = (a + b) / 2
+    geometry = add_visual(link, colour, middle, rpy_along(b - a))
+    ET.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(length))
 
 
 def draw_sphere(link: ET.Element, colour: Colour, centre: npt.ArrayLike, radius: float) -> None:
@@ -162,26 +171,37 @@ def sphere_obj(subdivisions: int = BALL_SUBDIVISIONS) -> str:
             half a second; 4 give 2562 vertices and a mean depth error of 0.05 % of the radius.
     """
     short, long = EDGES
-    base = np.array([[x * short, y * long, 0.0] for y in (1, -1) for x in (-1, 1)])
-    vertices = np.concatenate([np.roll(base, turn, axis=1) for turn in range(3)])
-    triangles = np.array(
-        [[int(corner, 16) for corner in triangle] for triangle in TRIANGLES.split()]
-    )
+    rectangle = np.array([[x * short, y * long, 0.0] for y in (1, -1) for x in (-1, 1)])
+    vertices = np.concatenate([np.roll(rectangle, turn, axis=1) for turn in range(3)])
+    corners = [[int(corner, 16) for corner in triangle] for triangle in TRIANGLES.split()]
+    triangles = np.array(corners)
     for _ in range(subdivisions):
-        edges = np.sort(
-            np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1
-        )
-        keys = edges[:, 1] * len(vertices) + edges[:, 0]
-        _, first, place = np.unique(keys, return_index=True, return_inverse=True)
-        (a, b, c), (ab, bc, ca) = triangles.T, len(vertices) + place.reshape(-1, 3).T
-        triangles = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-        vertices = np.concatenate([vertices, vertices[edges[first]].mean(axis=1)])
-        length = np.sqrt(np.dot(vertices**2, np.ones(3)))[:, None]
-        vertices = vertices + vertices / length * (1.0 - length)
+        vertices, triangles = _subdivided(vertices, triangles)
     points = [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines = [f"v {point}" for point in points] + [f"vn {point}" for point in points]
-    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (triangles + 1).tolist()]
+    lines = [f"v {point}" for point in points]
+    lines += [f"vn {point}" for point in points]
+    # Wavefront counts from 1; on the unit sphere a vertex is its own normal.
+    for a, b, c in (triangles + 1).tolist():
+        lines.append(f"f {a}//{a} {b}//{b} {c}//{c}")
     return "\n".join(lines) + "\n"
+
+
+def _subdivided(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return vertices (4 f, 3)/2 + 2 and triangles (4 f, 3) of a sphere whose f triangles are split in four."""
+    followers = np.roll(triangles, -1, axis=1)
+    edges = np.stack([triangles, followers], axis=-1).reshape(-1, 2)
+    edges = np.sort(edges, axis=1)
+    # Two triangles share each edge, and its middle: one new vertex for each pair of ends.
+    keys = edges[:, 1] * len(vertices) + edges[:, 0]
+    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    a, b, c = triangles.T
+    ab, bc, ca = len(vertices) + place.reshape(-1, 3).T
+    split = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1)
+    middles = vertices[edges[first]].mean(axis=1)
+    refined = np.concatenate([vertices, middles])
+    length = np.sqrt(np.dot(refined**2, np.ones(3)))[:, None]
+    on_sphere = refined + refined / length * (1.0 - length)
+    return on_sphere, split.reshape(-1, 3)
 
 
 def rectangles_obj(rectangles: list[tuple[float, float, float, float]], height: float) -> str:
@@ -196,10 +216,12 @@ def rectangles_obj(rectangles: list[tuple[float, float, float, float]], height: 
     """
     lines = ["vn 0 0 1"]
     for x0, y0, x1, y1 in rectangles:
-        lines += [f"v {x!r} {y!r} {height!r}" for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+        lines += [f"v {x!r} {y!r} {height!r}" for x, y in corners]
     for first in range(1, 4 * len(rectangles), 4):
         a, b, c, d = (f"{first + k}//1" for k in range(4))
-        lines += [f"f {a} {b} {c}", f"f {a} {c} {d}"]
+        lines.append(f"f {a} {b} {c}")
+        lines.append(f"f {a} {c} {d}")
     return "\n".join(lines) + "\n"
 
 
@@ -225,7 +247,8 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
             for material in visual.findall("material"):
                 visual.remove(material)
             for mesh in visual.findall("geometry/mesh"):
-                mesh.tag, mesh.attrib = "sphere", {"radius": repr(robot.workspace.ball_radius)}
+                mesh.tag = "sphere"
+                mesh.attrib = {"radius": repr(robot.workspace.ball_radius)}
         mass = link.find("inertial/mass")
         if link.get("name") == BALL_LINK and mass is not None:
             mass.set("value", repr(LIGHT_PART[0] + payload))
@@ -235,9 +258,11 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
 def room_boxes(scale: float = 1.0) -> tuple[Box, Box]:
     """Return the table's top, `scale` times that of a UR5, and the floor as obstacles."""
     x0, y0, x1, y1 = (scale * side for side in TABLE)
-    table = (x0 + x1) / 2, (y0 + y1) / 2, -TABLE_THICKNESS / 2
+    centre = ((x0 + x1) / 2, (y0 + y1) / 2, -TABLE_THICKNESS / 2)
+    size = (x1 - x0, y1 - y0, TABLE_THICKNESS)
+    table = Box("table", centre, size)
     floor = Box("floor", (0.0, 0.0, -FLOOR_DROP - 0.5), (10.0, 10.0, 1.0))
-    return Box("table", table, (x1 - x0, y1 - y0, TABLE_THICKNESS)), floor
+    return table, floor
 
 
 def boxes_urdf(boxes: tuple[Box, ...]) -> str:
@@ -248,7 +273,8 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
         drawn = add_visual(body, DARK_GREY, box.centre, np.zeros(3))
         collision = ET.SubElement(body, "collision")
         ET.SubElement(collision, "origin", xyz=numbers(box.centre), rpy=numbers(np.zeros(3)))
-        for geometry in (drawn, ET.SubElement(collision, "geometry")):
+        solid = ET.SubElement(collision, "geometry")
+        for geometry in (drawn, solid):
             ET.SubElement(geometry, "box", size=numbers(box.size))
     return text(robot)
 
@@ -265,16 +291,19 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    own, ball_radius = described.links, described.workspace.ball_radius
+    own = described.links
+    ball_radius = described.workspace.ball_radius
     if arm.n != described.n:
         raise ValueError(
             f"arm must have {described.n} joints like the {described.title}, got {arm.n}"
         )
-    mass, radius, aside = own.mass.tolist(), own.radius.tolist(), own.aside.tolist()
+    mass = own.mass.tolist()
+    radius = own.radius.tolist()
+    aside = own.aside.tolist()
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    # With a foot on the table and a stem up to the first joint
+    # The base has a foot on the table and a stem up to the first joint.
     base = add_link(robot, BASE_LINK, *BASE_PART)
     draw_cylinder(base, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius[0])
     draw_cylinder(base, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius[0])
@@ -285,19 +314,21 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
         centre = R @ own.centre[i] + step
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
-        inertia = own.inertia[i] if own.inertia.ndim == 2 else R @ own.inertia[i] @ R.T
+        inertia = own.inertia[i]
+        if own.inertia.ndim == 3:  # full tensors (n, 3, 3), which turn with the link
+            inertia = R @ inertia @ R.T
         link = add_link(robot, links[i + 1], mass[i], inertia, centre=centre, along=along)
         _draw_link(link, step, radius[i], aside[i])
         add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    # With a plate and the stick that carries the ball
+    # The flange has a plate and the stick that carries the ball.
     flange = add_link(robot, FLANGE_LINK, *LIGHT_PART)
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius[-1])
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, 0.0), arm.tool, 0.25 * ball_radius)
-    add_joint(
-        robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False
-    )
-    draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, BALL_MESH, ball_radius)
+    tool = np.stack([arm.tool, np.zeros(3)])
+    add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), tool, turns=False)
+    ball = add_link(robot, BALL_LINK, *LIGHT_PART)
+    draw_mesh(ball, RED, BALL_MESH, ball_radius)
     return robot
 
 
@@ -314,20 +345,32 @@ def bench_files(scale: float = 1.0) -> dict[str, str]:
     for x in (x0 + 0.04, x1 - 0.04):
         for y in (y0 + 0.04, y1 - 0.04):
             draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
-    rim = [(x0, y0, x0 + 0.02, y1), (x1 - 0.02, y0, x1, y1)]
-    rim += [(x0 + 0.02, y0, x1 - 0.02, y0 + 0.02), (x0 + 0.02, y1 - 0.02, x1 - 0.02, y1)]
-    top = [(x0 + 0.02, y0 + 0.02, x1 - 0.02, y1 - 0.02)]
+    # The rim lies around the top: two strips of full length along y, two between them.
+    left = x0 + RIM
+    right = x1 - RIM
+    front = y0 + RIM
+    back = y1 - RIM
+    rim = [
+        (x0, y0, left, y1),
+        (right, y0, x1, y1),
+        (left, y0, right, front),
+        (left, back, right, y1),
+    ]
+    top = [(left, front, right, back)]
+    # Tiles of two colours like those of a chessboard.
     tiles: tuple[list[tuple[float, float, float, float]], ...] = ([], [])
     for i in range(-6, 9):
         for j in range(-7, 7):
-            tiles[(i + j) % 2].append((i * TILE, j * TILE, (i + 1) * TILE, (j + 1) * TILE))
-    files = {}
-    for name, colour, rectangles, height in (
+            tile = (i * TILE, j * TILE, (i + 1) * TILE, (j + 1) * TILE)
+            tiles[(i + j) % 2].append(tile)
+    surfaces = (
         ("top", TABLE_TOP, top, 0.0),
         ("rim", TABLE_RIM, rim, 0.0),
         ("floor_a", FLOOR_A, tiles[0], -FLOOR_DROP),
         ("floor_b", FLOOR_B, tiles[1], -FLOOR_DROP),
-    ):
+    )
+    files = {}
+    for name, colour, rectangles, height in surfaces:
         files[f"{name}.obj"] = rectangles_obj(rectangles, height)
         draw_mesh(bench, colour, f"{name}.obj", 1.0)
     return files | {"bench.urdf": text(robot)}
@@ -335,22 +378,21 @@ def bench_files(scale: float = 1.0) -> dict[str, str]:
 
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
     """Draw a link: a capped housing about its joint, a tube beside it, and the connection to the next joint."""
-    top, corner = np.array([0.0, 0.0, side]), np.array([step[0], step[1], side])
+    top = np.array([0.0, 0.0, side])
+    corner = np.array([step[0], step[1], side])
     far_aside = abs(side) > radius
     # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
-    outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
-    draw_cylinder(
-        link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius
-    )
-    draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
+    direction = side if far_aside else -1.0
+    outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, direction)])
+    inner_end = np.zeros(3) if far_aside else -outwards
+    outer_end = top + outwards
+    draw_cylinder(link, ALUMINIUM, inner_end, outer_end, 1.06 * radius)
+    draw_cylinder(link, LIGHT_BLUE, outer_end, top + 1.25 * outwards, radius)
     draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
     draw_cylinder(link, DARK_GREY, corner, step, 0.95 * radius)
-    if far_aside:
-        draw_cylinder(
-            link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius
-        )
-        draw_cylinder(
-            link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius
-        )
-    else:
+    if not far_aside:
         draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
+        return
+    far_end = corner + 0.9 * outwards
+    draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, far_end, 1.02 * radius)
+    draw_cylinder(link, LIGHT_BLUE, far_end, corner + 1.1 * outwards, 0.95 * radius)
