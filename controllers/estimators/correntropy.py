@@ -43,9 +43,8 @@ def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
 def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> FloatArray:
     """Return |e|^(α−2) exp(−|e/β|^α), above 0, for normalised errors of any shape."""
     size = np.maximum(np.abs(error), MIN_ERROR)
-    return np.asarray(
-        size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT))
-    )
+    exponent = np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)
+    return np.asarray(size ** (shape - 2.0) * np.exp(-exponent))
 
 
 def weighted_gain(
@@ -54,7 +53,8 @@ def weighted_gain(
     """Return P Δq and the gain K of each row, (..., m, n), for weights of the measurement (..., m) alone."""
     dq = joint_step[..., None, :]
     PH = np.matvec(P, dq)
-    return PH, weight[..., None] * PH / (weight * np.vecdot(PH, dq) + r[..., None])[..., None]
+    variance = weight * np.vecdot(PH, dq) + r[..., None]
+    return PH, weight[..., None] * PH / variance[..., None]
 
 
 def corrected(
@@ -69,7 +69,8 @@ def corrected(
     """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form."""
     dq = joint_step[..., None, :]
     P = symmetric(joseph(P, np.matvec(P, dq), gain, dq, r[..., None]))
-    return J + (feature_step - np.matvec(J, joint_step))[..., None] * gain, P
+    innovation = feature_step - np.matvec(J, joint_step)
+    return J + innovation[..., None] * gain, P
 
 
 @settings
@@ -107,6 +108,24 @@ class Iterate(NamedTuple):
     moves: BoolArray  # (...), whether Ĵ changed by more than the tolerance
 
 
+class Measured(NamedTuple):
+    """The quantities that stay the same during the iteration."""
+
+    J: FloatArray  # J⁻, (..., m, n), m/rad
+    B: FloatArray  # Cholesky factor of the covariance of each row, (..., m, n, n)
+    h: FloatArray  # BᵀΔq, (..., m, n)
+    joint_step: FloatArray  # Δq, (..., n), rad
+    feature_step: FloatArray  # Δy, (..., m), m
+    r: FloatArray  # variance of each component of Δy, (...), m²
+
+
+class Iteration(NamedTuple):
+    """The tree on which the iteration works."""
+
+    at: Iterate
+    given: Measured
+
+
 def fixed_point_update(
     J: FloatArray,
     P: FloatArray,
@@ -136,27 +155,36 @@ def fixed_point_update(
     """
     B = cholesky_of(P)
     h = np.vecmat(joint_step[..., None, :], B)
+    given = Measured(J, B, h, joint_step, feature_step, r)
 
-    given: tuple[FloatArray, ...] = J, B, h, joint_step, feature_step, r
-
-    def improved(
-        tree: tuple[Iterate, tuple[FloatArray, ...]],
-    ) -> tuple[Iterate, tuple[FloatArray, ...]]:
-        at, (J, B, h, dq, dy, r) = tree
+    def improved(tree: Iteration) -> Iteration:
+        at = tree.at
+        J, B, h, dq, dy, r = tree.given
         error = (dy - np.matvec(at.J, dq)) / np.sqrt(r)[..., None]
-        spread, w = h / weight(at.prior), weight(error)
+        spread = h / weight(at.prior)
+        w = weight(error)
         share = w / (w * np.vecdot(h, spread) + r[..., None])
         gain = share[..., None] * np.matvec(B, spread)
         nu = dy - np.matvec(J, dq)
         new = J + nu[..., None] * gain
-        change, size = (norm(each.reshape(*each.shape[:-2], -1)) for each in (new - at.J, at.J))
-        return Iterate(
-            new, gain, -(share * nu)[..., None] * spread, change > config.tolerance * size
-        ), tree[1]
+        # B⁻¹ (J⁻ − J) without a solve: J − J⁻ = ν Kᵀ, and B⁻¹ K is the share times the spread.
+        prior = -(share * nu)[..., None] * spread
+        change = norm(_flat(new - at.J))
+        moves = change > config.tolerance * norm(_flat(at.J))
+        return Iteration(Iterate(new, gain, prior, moves), tree.given)
 
-    at = Iterate(J, np.zeros_like(J), np.zeros_like(J), np.ones_like(r, dtype=np.bool_)[()])
-    at, _ = repeat(lambda tree: tree[0].moves, improved, (at, given), config.iterations)
-    return corrected(J, P, at.gain, joint_step, feature_step, r=r)
+    first = Iterate(J, np.zeros_like(J), np.zeros_like(J), np.ones_like(r, dtype=np.bool_)[()])
+    last = repeat(_moves, improved, Iteration(first, given), config.iterations)
+    return corrected(J, P, last.at.gain, joint_step, feature_step, r=r)
+
+
+def _moves(tree: Iteration) -> BoolArray:
+    return tree.at.moves
+
+
+def _flat(J: FloatArray) -> FloatArray:
+    """Return the entries of each J, (..., mn)."""
+    return J.reshape(*J.shape[:-2], -1)
 
 
 def mckf_estimator(
@@ -173,9 +201,8 @@ def mckf_estimator(
     until x stays. Then P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ. Ren and Li applied it to visual servoing.
     """
     weight = partial(gaussian_weight, bandwidth=config.bandwidth)
-    return RandomWalkEstimator(
-        config, partial(fixed_point_update, weight=weight, config=config), "by_rows"
-    )
+    update = partial(fixed_point_update, weight=weight, config=config)
+    return RandomWalkEstimator(config, update, "by_rows")
 
 
 def gmckf_estimator(
@@ -194,9 +221,8 @@ def gmckf_estimator(
     `MIN_ERROR`. The paper's choice of α by an estimate of the kurtosis is left out; α is a setting.
     """
     weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
-    return RandomWalkEstimator(
-        config, partial(fixed_point_update, weight=weight, config=config), "by_rows"
-    )
+    update = partial(fixed_point_update, weight=weight, config=config)
+    return RandomWalkEstimator(config, update, "by_rows")
 
 
 @settings
@@ -218,8 +244,8 @@ def imcckf_update(
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
-    weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)[..., None]
-    PH, gain = weighted_gain(P, joint_step, weight, r)
+    weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)
+    PH, gain = weighted_gain(P, joint_step, weight[..., None], r)
     return J + innovation[..., None] * gain, symmetric(P - outer(gain, PH))
 
 
@@ -259,10 +285,8 @@ def rmckf_update(
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
-    weight = (
-        gaussian_weight(innovation / np.sqrt(r)[..., None], config.bandwidth)
-        + config.regularisation
-    )
+    normalised = innovation / np.sqrt(r)[..., None]
+    weight = gaussian_weight(normalised, config.bandwidth) + config.regularisation
     _, gain = weighted_gain(P, joint_step, weight, r)
     return corrected(J, P, gain, joint_step, feature_step, r=r)
 

@@ -13,9 +13,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm
 
 State = TypeVar("State")
-MOTION_TIME: Final = (
-    0.05  # [s] shortest motion at any control period, so that as much is learned per second
-)
+# [s] Shortest motion at any control period, so that as much is learned per second.
+MOTION_TIME: Final = 0.05
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,7 +33,7 @@ class Motion:
 class Estimator(ABC, Generic[State]):
     """Estimates J = ∂y/∂q from motions; any estimator works with any law."""
 
-    # whether it knows a Jacobian for every joint position by itself, so that no other model is added
+    # Whether it knows a Jacobian for every joint position by itself, so that no other model is added.
     brings_model: ClassVar[bool] = False
 
     @abstractmethod

@@ -84,7 +84,8 @@ def cholesky_of(P: FloatArray) -> FloatArray:
         raise FilterDiverged(
             f"covariance is not positive definite: smallest eigenvalue {lowest:.3e}"
         ) from error
-    if not is_finite(L):  # LAPACK lets NaN pass
+    # LAPACK lets NaN pass.
+    if not is_finite(L):
         raise FilterDiverged(
             f"covariance is not finite: diagonal {np.diagonal(P, axis1=-2, axis2=-1).tolist()}"
         )
@@ -123,15 +124,15 @@ def kalman_update(
         The new Jacobian and covariance.
     """
     *lead, m, n = J.shape
-    x, H = (
-        J.reshape(*lead, m * n),
-        (np.eye(m)[..., None] * joint_step[..., None, None, :]).reshape(*lead, m, m * n),
-    )
-    HP, R = H @ P, r[..., None, None] * np.eye(m)
+    x = J.reshape(*lead, m * n)
+    H = (np.eye(m)[..., None] * joint_step[..., None, None, :]).reshape(*lead, m, m * n)
+    R = r[..., None, None] * np.eye(m)
+    HP = H @ P
     K = np.linalg.solve(HP @ H.mT + R, HP).mT
     A = np.eye(m * n) - K @ H
     P = A @ P @ A.mT + K @ R @ K.mT
-    return (x + np.matvec(K, feature_step - np.matvec(H, x))).reshape(J.shape), symmetric(P)
+    x = x + np.matvec(K, feature_step - np.matvec(H, x))
+    return x.reshape(J.shape), symmetric(P)
 
 
 def split_update(
@@ -143,9 +144,8 @@ def split_update(
     """
     PH = np.matvec(P, joint_step)
     K = PH / (np.vecdot(joint_step, PH) + r)[..., None]
-    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(
-        joseph(P, PH, K, joint_step, r)
-    )
+    P = joseph(P, PH, K, joint_step, r)
+    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(P)
 
 
 Update: TypeAlias = Callable[..., tuple[FloatArray, FloatArray]]
@@ -173,25 +173,30 @@ class RandomWalkEstimator(GatedEstimator[WalkState]):
     def __init__(self, config: RandomWalk, update: Update, covariance: Covariance) -> None:
         """Take the settings of the walk, the formula, and the form of its covariance."""
         super().__init__(config)
-        self._formula, self._covariance = update, covariance
+        self._formula = update
+        self._covariance = covariance
         self._walk = config.walk**2
         self._noise: FloatArray = np.asarray(config.feature_noise)[()]
 
     def start(self, jacobian: FloatArray) -> WalkState:
         """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance."""
         *lead, m, n = jacobian.shape
-        shape = {"shared": (n, n), "by_rows": (m, n, n), "full": (m * n, m * n)}[self._covariance]
-        P = np.broadcast_to(np.eye(shape[-1]) * self._config.initial_deviation**2, (*lead, *shape))
+        shapes = {"shared": (n, n), "by_rows": (m, n, n), "full": (m * n, m * n)}
+        shape = shapes[self._covariance]
+        P = np.eye(shape[-1]) * self._config.initial_deviation**2
+        P = np.broadcast_to(P, (*lead, *shape))
         return WalkState(jacobian, P, np.full(lead, False))
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         noise: FloatArray = self._noise if motion.noise is None else motion.noise
-        walk, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
+        walk = self._walk * np.asarray(motion.duration)
+        r = 2.0 * noise * noise
         if r.ndim < walk.ndim:
             r = np.broadcast_to(r, walk.shape)
-        P = plus_diagonal(
-            state.P, walk[..., None, None] if self._covariance == "by_rows" else walk[..., None]
-        )
+        diagonal = walk[..., None]
+        if self._covariance == "by_rows":
+            diagonal = diagonal[..., None]
+        P = plus_diagonal(state.P, diagonal)
         J, P = self._formula(state.J, P, motion.joint_step, motion.feature_step, r=r)
         cholesky_of(P)
         return state._replace(J=J, P=P)
@@ -275,19 +280,22 @@ def unscented_update(
         FilterDiverged: P is not positive definite.
     """
     *lead, m, n = J.shape
-    size, weights = m * n, sigma_weights(m * n, config.alpha, config.beta, config.kappa)
+    size = m * n
+    weights = sigma_weights(size, config.alpha, config.beta, config.kappa)
     reach = weights.reach * cholesky_of(P).mT
     offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
-    # A point is m rows of J
-    Z = np.matvec(points.reshape(*lead, 2 * size + 1, m, n), joint_step[..., None, :])
+    # Each point is m rows of J.
+    jacobians = points.reshape(*lead, 2 * size + 1, m, n)
+    Z = np.matvec(jacobians, joint_step[..., None, :])
     z = np.vecmat(weights.mean, Z)
     deviations = Z - z[..., None, :]
     weighted = weights.covariance[:, None] * deviations
     S = deviations.mT @ weighted + r[..., None, None] * np.eye(m)
     C = offsets.mT @ weighted
     K = np.linalg.solve(S, C.mT).mT
-    P = P - K @ C.mT  # K S = C
+    # K S Kᵀ = K Cᵀ, as K S = C.
+    P = P - K @ C.mT
     return J + np.matvec(K, feature_step - z).reshape(J.shape), symmetric(P)
 
 
@@ -319,7 +327,8 @@ class RlsConfig:
 
     def __post_init__(self) -> None:
         """Check across fields."""
-        limit, least = self.covariance_limit, self.initial_covariance
+        limit = self.covariance_limit
+        least = self.initial_covariance
         if limit < least:
             raise ValueError(
                 f"covariance_limit must be at least initial_covariance = {least:g}, got {limit:g}"
@@ -364,20 +373,18 @@ class RlsEstimator(GatedEstimator[WalkState]):
 
     def start(self, jacobian: FloatArray) -> WalkState:
         """Start from Ĵ₀, (..., m, n), m/rad, with P (..., n, n), 1/rad²."""
-        lead, n = jacobian.shape[:-2], jacobian.shape[-1]
+        *lead, _, n = jacobian.shape
         P = np.broadcast_to(np.eye(n) * self._config.initial_covariance, (*lead, n, n))
         return WalkState(jacobian, P, np.full(lead, False))
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
-        config, dq, dy = self._config, motion.joint_step, motion.feature_step
+        config = self._config
+        forgetting = np.exp(-np.asarray(motion.duration) / config.memory)
         J, P = rls_update(
-            state.J,
-            state.P,
-            dq,
-            dy,
-            forgetting=np.exp(-np.asarray(motion.duration) / config.memory),
+            state.J, state.P, motion.joint_step, motion.feature_step, forgetting=forgetting
         )
-        P = P * np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))[..., None, None]
+        kept = np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))
+        P = P * kept[..., None, None]
         cholesky_of(P)
         return state._replace(J=J, P=P)
 
@@ -387,5 +394,6 @@ class RlsEstimator(GatedEstimator[WalkState]):
 
 
 def _mean_diagonal(P: FloatArray) -> FloatArray:
+    """Return the mean of the diagonal of P, (...)."""
     mean: FloatArray = P.trace(axis1=-2, axis2=-1) / P.shape[-1]
     return mean

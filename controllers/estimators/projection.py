@@ -100,19 +100,30 @@ class ProjectionEstimator(GatedEstimator[ProjectionState]):
         return ProjectionState(jacobian, jacobian, np.full(lead, False), np.zeros(lead))
 
     def _correct(self, state: ProjectionState, motion: Motion) -> ProjectionState:
-        config, dq, dy = self._config, motion.joint_step, motion.feature_step
+        config = self._config
         regularisation = config.regularisation if isinstance(config, CfdlConfig) else 0.0
         J = projection_update(
-            state.J, dq, dy, step_factor=config.step_factor, regularisation=regularisation
+            state.J,
+            motion.joint_step,
+            motion.feature_step,
+            step_factor=config.step_factor,
+            regularisation=regularisation,
         )
         state = state._replace(J=J)
         if isinstance(config, BroydenConfig) or not config.reset:
             return state
-        flat, first = J.reshape(*J.shape[:-2], -1), state.J0.reshape(*J.shape[:-2], -1)
-        lost = (np.vecdot(flat, first) <= 0.0) | (np.vecdot(flat, flat) < config.reset_norm**2)
-        return branch(lost, lambda lost: lost._replace(J=lost.J0, resets=lost.resets + 1.0), state)
+        flat = J.reshape(*J.shape[:-2], -1)
+        first = state.J0.reshape(*J.shape[:-2], -1)
+        turned = np.vecdot(flat, first) <= 0.0
+        vanished = np.vecdot(flat, flat) < config.reset_norm**2
+        return branch(turned | vanished, _reset, state)
 
     def diagnostics(self, state: ProjectionState) -> Diagnostics:
         """Return whether the last motion was used and, of the compact form, how often Φ was reset in this run."""
         resets = {"jacobian_resets": state.resets} if isinstance(self._config, CfdlConfig) else {}
         return {"estimator_updated": state.updated, **resets}
+
+
+def _reset(state: ProjectionState) -> ProjectionState:
+    """Return the state with Φ₀ in place of Φ."""
+    return state._replace(J=state.J0, resets=state.resets + 1.0)

@@ -53,16 +53,19 @@ def window_step(
     """
     flat = (*sizes.shape[:-2], -1)
     size = sizes.reshape(flat)
-    total = np.vecdot((joint_steps * joint_steps).reshape(flat), size)
-    total = total + epsilon * np.add.reduce(size, axis=-1) / (count * sizes.shape[-1])
-    return np.where(total > 0.0, k2 / np.where(total > 0.0, total, 1.0), 0.0)[()]
+    squares = (joint_steps * joint_steps).reshape(flat)
+    entries = count * sizes.shape[-1]
+    total = np.vecdot(squares, size)
+    total = total + epsilon * np.add.reduce(size, axis=-1) / entries
+    moved = total > 0.0
+    return np.where(moved, k2 / np.where(moved, total, 1.0), 0.0)[()]
 
 
 class RbfState(NamedTuple):
     """The state of the update; the window holds the T − 1 motions before the next one, the newest last."""
 
     rows: FloatArray  # W by rows of the Jacobian, (..., m, n, L), m/rad
-    theta: FloatArray  # θ of the window, (..., T−1, U, L); 0 where a motion is still missing, as in the next two
+    theta: FloatArray  # θ in the window, (..., T−1, U, L); 0 where a motion is still missing, as in the next two
     joint_steps: FloatArray  # Δq of the window, (..., T−1, n), rad
     feature_steps: FloatArray  # Δy of the window, (..., T−1, m), m
     filled: npt.NDArray[np.int_]  # how many motions there are, (...)
@@ -93,8 +96,13 @@ class NetworkEstimator(Estimator[NetworkState]):
         """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
         self._network = networks.jacobian
-        self._position, self._shape = b"", (-1,)
-        self._theta, self._rows, self._jacobian, self._changed, self._change = (np.empty(0),) * 5
+        self._position = b""
+        self._shape: tuple[int, ...] = (-1,)
+        self._theta = np.empty(0)
+        self._rows = np.empty(0)
+        self._jacobian = np.empty(0)
+        self._changed = np.empty(0)
+        self._change = np.empty(0)
 
     def _started(self, jacobian: FloatArray) -> FloatArray:
         """Return the offline weights, (..., m, n, L); Ĵ₀, which holds for one joint position alone, is left out."""
@@ -106,7 +114,10 @@ class NetworkEstimator(Estimator[NetworkState]):
         position = q.tobytes()
         if position != self._position or q.shape != self._shape:
             self._theta = self._network.features(q)
-            self._position, self._shape, self._rows = position, q.shape, np.empty(0)
+            self._position = position
+            self._shape = q.shape
+            # Ĵ of the last rows was that at another joint position.
+            self._rows = np.empty(0)
         return self._theta
 
     def jacobian(self, state: NetworkState, joint_position: FloatArray) -> FloatArray:
@@ -120,16 +131,16 @@ class NetworkEstimator(Estimator[NetworkState]):
         if first is None:
             return self.jacobian(state, joint_position)
         if state.rows is not self._changed:
-            self._changed, self._change = state.rows, state.rows - first.rows
+            self._changed = state.rows
+            self._change = state.rows - first.rows
         return self._with_rows(self._change, joint_position)
 
     def _with_rows(self, rows: FloatArray, q: FloatArray) -> FloatArray:
+        """Return the Jacobian of weights by rows, (..., m, n), at q, (..., n), rad."""
         theta = self.features(q)
         if rows is not self._rows:
-            self._jacobian, self._rows = (
-                self._network.output(rows, theta[..., None, :, :])[..., 0, :, :],
-                rows,
-            )
+            self._jacobian = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :]
+            self._rows = rows
         return self._jacobian
 
 
@@ -156,11 +167,9 @@ class RbfEstimator(NetworkEstimator[RbfState]):
 
     def start(self, jacobian: FloatArray) -> RbfState:
         """Start from the offline network, without regard to Ĵ₀."""
-        lead, window, (layers, units) = (
-            jacobian.shape[:-2],
-            self._config.window,
-            self._network.layers,
-        )
+        lead = jacobian.shape[:-2]
+        window = self._config.window
+        layers, units = self._network.layers
         return RbfState(
             rows=self._started(jacobian),
             theta=np.zeros((*lead, window - 1, layers, units)),
@@ -173,14 +182,14 @@ class RbfEstimator(NetworkEstimator[RbfState]):
 
     def update(self, state: RbfState, motion: Motion) -> RbfState:
         """Learn from the window that `motion` completes."""
-        config, network = self._config, self._network
+        config = self._config
+        network = self._network
         epsilon: FloatArray | float = config.epsilon
         if motion.noise is not None:
             ratio = motion.noise / REFERENCE_NOISE
             epsilon = epsilon * (ratio * ratio)
-        theta = np.concatenate(
-            [state.theta, self.features(motion.joint_position)[..., None, :, :]], axis=-3
-        )
+        newest = self.features(motion.joint_position)
+        theta = np.concatenate([state.theta, newest[..., None, :, :]], axis=-3)
         joint_steps = np.concatenate([state.joint_steps, motion.joint_step[..., None, :]], axis=-2)
         feature_steps = np.concatenate(
             [state.feature_steps, motion.feature_step[..., None, :]], axis=-2
@@ -194,8 +203,15 @@ class RbfEstimator(NetworkEstimator[RbfState]):
         if config.leak:
             gone = -np.expm1(-config.leak * motion.duration)
             rows -= gone[..., None, None, None] * (rows - network.rows)
-        past = theta[..., 1:, :, :], joint_steps[..., 1:, :], feature_steps[..., 1:, :]
-        return RbfState(rows, *past, filled, errors, step)
+        return RbfState(
+            rows=rows,
+            theta=theta[..., 1:, :, :],
+            joint_steps=joint_steps[..., 1:, :],
+            feature_steps=feature_steps[..., 1:, :],
+            filled=filled,
+            errors=errors,
+            step=step,
+        )
 
     def diagnostics(self, state: RbfState) -> Diagnostics:
         """Return the step size α₂, the root of Q, the window's prediction error (m), and the norm of all weights."""
@@ -242,15 +258,13 @@ class RbfLyapunovEstimator(NetworkEstimator[RbfLyapunovState]):
 
     def update(self, state: RbfLyapunovState, motion: Motion) -> RbfLyapunovState:
         """Learn from one motion."""
-        q, dq, theta = (
-            motion.joint_position,
-            motion.joint_step[..., None, :],
-            self.features(motion.joint_position),
-        )
-        unexplained = motion.feature_step - np.matvec(self.jacobian(state, q), motion.joint_step)
+        q = motion.joint_position
+        dq = motion.joint_step
+        theta = self.features(q)
+        unexplained = motion.feature_step - np.matvec(self.jacobian(state, q), dq)
         s = unexplained / np.asarray(motion.duration)[..., None]
         pull = self._config.n3 * s - self._config.n2 * motion.error
-        rows = self._network.gradient(pull[..., None, :], dq, theta[..., None, :, :])
+        rows = self._network.gradient(pull[..., None, :], dq[..., None, :], theta[..., None, :, :])
         np.add(rows, state.rows, out=rows)
         return RbfLyapunovState(rows, s)
 

@@ -42,7 +42,7 @@ SCALE_RATE: Final = 1.0  # [1/s] at which ln s rises or sinks
 MAX_SCALE: Final = 1e3  # [1] largest s
 REJECTION_WEIGHT: Final = 0.01  # [1] a smaller weight is a rejection
 MEMORY: Final = 1.0  # [s] time constant with which rejections are forgotten
-LOST_SHARE: Final = 0.7  # [1] of rejections, above which a feature is reset to its measurement
+LOST_SHARE: Final = 0.7  # [1] share of rejections above which a feature is reset to its measurement
 
 
 @settings
@@ -96,10 +96,10 @@ class RobustEstimator(Estimator[RobustState]):
 
     def start(self, jacobian: FloatArray) -> RobustState:
         """Start from Ĵ₀, (..., m, n), m/rad, and the first measurement of the feature."""
-        config, (*lead, m, n) = self._config, jacobian.shape
-        variances = np.concatenate(
-            [[config.feature_noise**2], np.full(n, config.initial_deviation**2)]
-        )
+        *lead, m, n = jacobian.shape
+        feature_variance = self._config.feature_noise**2
+        entry_variances = np.full(n, self._config.initial_deviation**2)
+        variances = np.concatenate([[feature_variance], entry_variances])
         P = np.broadcast_to(np.diag(variances), (*lead, m, n + 1, n + 1))
         zero = np.zeros((*lead, m))
         return RobustState(jacobian, P, zero, np.ones(lead)[()], zero)
@@ -116,35 +116,45 @@ class RobustEstimator(Estimator[RobustState]):
         innovation = state.deviation + motion.feature_step - predicted
         P = self._predicted(state.P, motion.joint_step, predicted, duration)
         cholesky_of(P)
-        column, deviation = P[..., 0], sigma * state.scale
-        variance, noise = (
-            column[..., 0],
-            (deviation * deviation)[..., None] * np.ones_like(innovation),
-        )
+        column = P[..., 0]
+        variance = column[..., 0]
+        sigma_s = sigma * state.scale
+        noise = (sigma_s * sigma_s)[..., None] * np.ones_like(innovation)
         weight = irls_weight(innovation, variance, noise)
         gain = weight[..., None] * column / (weight * variance + noise)[..., None]
         J = state.J + innovation[..., None] * gain[..., 1:]
         P = P - outer(gain, column)
+        deviation = innovation * (1.0 - gain[..., 0])
+
         keep = np.exp(-duration / MEMORY)[..., None]
         rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTION_WEIGHT)
         lost = rejected > LOST_SHARE
         P = where(lost, _restarted_at_frame(P, noise), (P + P.mT) / 2)
-        excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(
-            axis=-1
-        )
+
+        # The scale rises with each innovation above the normal median, and sinks with each below.
+        median = NORMAL_MEDIAN * np.sqrt(variance + noise)
+        excess = np.sign(np.abs(innovation) - median).mean(axis=-1)
         scale = np.clip(state.scale * np.exp(SCALE_RATE * duration * excess), 1.0, MAX_SCALE)
-        deviation, none = innovation * (1.0 - gain[..., 0]), np.zeros_like(innovation)
-        return RobustState(J, P, where(lost, none, deviation), scale, where(lost, none, rejected))
+        none = np.zeros_like(innovation)
+        return RobustState(
+            J=J,
+            P=P,
+            deviation=where(lost, none, deviation),
+            scale=scale,
+            rejected=where(lost, none, rejected),
+        )
 
     def _predicted(
         self, P: FloatArray, joint_step: FloatArray, predicted: FloatArray, duration: FloatArray
     ) -> FloatArray:
         """Return the covariance after a motion: F P Fᵀ + Q with F = [[1, Δqᵀ], [0, I]]."""
-        config, n = self._config, joint_step.shape[-1]
+        config = self._config
+        n = joint_step.shape[-1]
         F = np.broadcast_to(np.eye(n + 1), (*joint_step.shape[:-1], n + 1, n + 1)).copy()
         F[..., 0, 1:] = joint_step
         F = F[..., None, :, :]
-        walk = np.where(norm(joint_step) >= config.min_joint_step, config.walk**2 * duration, 0.0)
+        moves = norm(joint_step) >= config.min_joint_step
+        walk = np.where(moves, config.walk**2 * duration, 0.0)
         Q = np.broadcast_to(walk[..., None, None], (*predicted.shape, n + 1)).copy()
         Q[..., 0] = (config.motion_error * norm(predicted)[..., None]) ** 2
         return F @ P @ F.mT + Q[..., None] * np.eye(n + 1)
@@ -162,6 +172,7 @@ class RobustEstimator(Estimator[RobustState]):
 def _restarted_at_frame(P: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the covariance of a feature that is reset to its measurement, which holds no information about J."""
     taken = P.copy()
-    taken[..., 0, :] = taken[..., :, 0] = 0.0
+    taken[..., 0, :] = 0.0
+    taken[..., :, 0] = 0.0
     taken[..., 0, 0] = noise
     return taken
