@@ -26,12 +26,11 @@ class Estimate:
 class Law(ABC, Generic[State]):
     """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator."""
 
-    # the stages of the chain that the law brings itself, so that a controller may not add another one; "preview": it
-    # looks at more of the reference than the present row
+    # The stages of the chain that the law brings itself, so that a controller may not add another one; "preview": it
+    # looks at more of the reference than the present row.
     owns: frozenset[Stage] = frozenset()
-    in_model_frame: bool = (
-        False  # whether it was trained on the nominal model, so that it works in that model's frame
-    )
+    # Whether it was trained on the nominal model, so that it works in that model's frame.
+    in_model_frame: bool = False
 
     @abstractmethod
     def start(self, observation: Observation) -> State:

@@ -43,7 +43,8 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
         The joint step of one period, (..., n), rad.
     """
     square = plus_diagonal(J @ J.mT, step_weight)
-    return np.asarray(step_factor * np.vecmat(np.linalg.solve(square, e[..., None])[..., 0], J))
+    solution = np.linalg.solve(square, e[..., None])[..., 0]
+    return np.asarray(step_factor * np.vecmat(solution, J))
 
 
 @final
@@ -53,7 +54,8 @@ class MfacLaw(Law[None]):
     def __init__(self, config: MfacConfig, knowledge: RobotKnowledge) -> None:
         """Take settings and period."""
         self._dt = knowledge.spec.period
-        self._share, self._weight = 1.0 - math.exp(-config.gain * self._dt), config.step_weight
+        self._rho = 1.0 - math.exp(-config.gain * self._dt)
+        self._lambda = config.step_weight
 
     def start(self, observation: Observation) -> None:
         """Begin; the law has no state."""
@@ -63,4 +65,4 @@ class MfacLaw(Law[None]):
     ) -> tuple[None, FloatArray]:
         """Return u, (..., n), rad/s; see `Law.command`."""
         e = reference[..., 0, :] - observation.feature
-        return state, mfac_step(estimate.jacobian, e, self._share, self._weight) / self._dt
+        return state, mfac_step(estimate.jacobian, e, self._rho, self._lambda) / self._dt

@@ -67,10 +67,8 @@ class PidLaw(Law[PidState]):
 
     def start(self, observation: Observation) -> PidState:
         """Return zero integral and derivative."""
-        zero, never = (
-            np.zeros(observation.feature.shape),
-            np.full(observation.feature.shape[:-1], np.inf),
-        )
+        zero = np.zeros(observation.feature.shape)
+        never = np.full(observation.feature.shape[:-1], np.inf)
         return PidState(
             integral=zero,
             derivative=zero,
@@ -89,20 +87,17 @@ class PidLaw(Law[PidState]):
             integral_before=state.integral, since_feature=state.since_feature + self._dt
         )
         state = branch(observation.feature_valid, self._learn, state, e)
-        v = (
-            self._rate * e
-            + config.integral_gain * state.integral
-            + config.derivative_gain * state.derivative
-        )
+        integral = config.integral_gain * state.integral
+        derivative = config.derivative_gain * state.derivative
+        v = self._rate * e + integral + derivative
         return state, np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
 
     def noted(self, state: PidState, joint_velocity: FloatArray, limited: BoolArray) -> PidState:
         """Hold an integral that grows while the command is limited."""
-        integral, before = state.integral, state.integral_before
-        winds_up = limited & (np.vecdot(integral, integral) >= np.vecdot(before, before))
-        return branch(
-            winds_up, lambda winding: winding._replace(integral=winding.integral_before), state
-        )
+        integral = state.integral
+        before = state.integral_before
+        grows = np.vecdot(integral, integral) >= np.vecdot(before, before)
+        return branch(limited & grows, _held, state)
 
     def diagnostics(self, state: PidState) -> Diagnostics:
         """Return the norm of the integral, m s."""
@@ -110,9 +105,18 @@ class PidLaw(Law[PidState]):
 
     def _learn(self, state: PidState, e: FloatArray) -> PidState:
         """Integrate and differentiate the error of a valid feature; the first one has no derivative."""
-        tau, passed = self._config.derivative_filter, state.since_feature
-        derivative = (tau * state.derivative + e - state.last_error) / (tau + passed)[..., None]
-        integral = state.integral + self._dt * e
+        tau = self._config.derivative_filter
+        T = state.since_feature
+        derivative = (tau * state.derivative + e - state.last_error) / (tau + T)[..., None]
         return PidState(
-            integral, derivative, e, state.integral_before, since_feature=np.zeros_like(passed)
+            integral=state.integral + self._dt * e,
+            derivative=derivative,
+            last_error=e,
+            integral_before=state.integral_before,
+            since_feature=np.zeros_like(T),
         )
+
+
+def _held(state: PidState) -> PidState:
+    """Return the state with the integral of the period before."""
+    return state._replace(integral=state.integral_before)

@@ -67,20 +67,27 @@ def roll_out(
     """
     *lead, horizon, m = reference_steps.shape
     n, p, hidden = weights.shape[-3:]
-    lengths = history[0].shape[-2], history[1].shape[-2]
-    A = np.broadcast_to(_shift(m, n, *lengths), (*lead, p, p + n + m)).copy()
+    errors, positions = history
+    shift = _shift(m, n, errors.shape[-2], positions.shape[-2])
+    A = np.broadcast_to(shift, (*lead, p, p + n + m)).copy()
     A[..., :m, p : p + n] = -jacobian
-    states, hs = np.empty((*lead, horizon + 1, p + n + m)), np.empty((*lead, horizon, hidden))
-    # A state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ
+    # A state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ.
+    states = np.empty((*lead, horizon + 1, p + n + m))
+    hs = np.empty((*lead, horizon, hidden))
     xis = states[..., :p]
-    xis[..., 0, :], states[..., :-1, p + n :] = information_vector(*history), reference_steps
-    reach, wanted = 1.0 / step_limit, np.zeros((*lead, n))
+    xis[..., 0, :] = information_vector(errors, positions)
+    states[..., :-1, p + n :] = reference_steps
+    reach = 1.0 / step_limit
+    wanted = np.zeros((*lead, n))
     for t in range(horizon):
-        state, xi = states[..., t, :], xis[..., t, :]
-        h = hs[..., t, :] = network.features(xi)
+        state = states[..., t, :]
+        xi = xis[..., t, :]
+        h = network.features(xi)
+        hs[..., t, :] = h
         dq = controller_output(weights, xi, h) - network.origin(xi)
         if t == 0:
             wanted = dq
+        # The joint that exceeds its limit most sets the scale of all, as the stage "limit" does.
         excess = np.maximum.reduce(np.abs(dq) * reach, axis=-1, keepdims=True, initial=1.0)
         state[..., p : p + n] = dq / excess
         np.matvec(A, state, out=xis[..., t + 1, :])
@@ -93,14 +100,20 @@ def _shift(m: int, n: int, error_history: int, position_history: int) -> FloatAr
 
     The newest error is e + Δy_ref and the newest position q + Δq; older ones move on by one place.
     """
-    newest, p = m * error_history, m * error_history + n * position_history
+    positions = m * error_history  # where positions begin in ξ
+    p = positions + n * position_history
     A = np.zeros((p, p + n + m))
-    for size, begin, end, added in ((m, 0, newest, p + n), (n, newest, p, p)):
-        first, older = slice(begin, begin + size), slice(begin + size, end)
-        A[first, first] = A[first, added : added + size] = np.eye(size)
-        A[older, begin : end - size] = np.eye(end - begin - size)
+    _push_entries(A, 0, positions, size=m, added=p + n)
+    _push_entries(A, positions, p, size=n, added=p)
     A.flags.writeable = False
     return A
+
+
+def _push_entries(A: FloatArray, begin: int, end: int, size: int, added: int) -> None:
+    """Fill the rows of a history from `begin` to `end`, `size` entries each, whose newest grows by those at `added`."""
+    A[begin : begin + size, begin : begin + size] = np.eye(size)
+    A[begin : begin + size, added : added + size] = np.eye(size)
+    A[begin + size : end, begin : end - size] = np.eye(end - begin - size)
 
 
 def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:
@@ -108,12 +121,14 @@ def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:
     pull = ahead.errors @ jacobian
     outer = pull[..., :, None] * ahead.xi[..., None, :]
     *lead, horizon, n, p = outer.shape
-    return np.asarray(outer.reshape(*lead, horizon, n * p).mT @ ahead.h).reshape(*lead, n, p, -1)
+    flat = outer.reshape(*lead, horizon, n * p)
+    return np.asarray(flat.mT @ ahead.h).reshape(*lead, n, p, -1)
 
 
 def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float) -> FloatArray:
     """Return α = k Σ‖e(k+t)‖² / (ε + ‖G‖²_F), (...), (eq. 23 with ε); 0 where there is nothing to descend."""
-    wanted, size = k * sum_of_squares(ahead.errors, 2), epsilon + sum_of_squares(direction, 3)
+    wanted = k * sum_of_squares(ahead.errors, 2)
+    size = epsilon + sum_of_squares(direction, 3)
     quotient: FloatArray = wanted * (size > 0.0) / (size + (size == 0.0))
     return quotient
 
@@ -154,7 +169,7 @@ class RbfnnState(NamedTuple):
     errors: FloatArray  # e, the newest first, a row for each period, (..., rows, m), m; NaN before the first command
     positions: FloatArray  # q, likewise, (..., rows, n), rad
     predicted: FloatArray  # e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them
-    step_size: FloatArray  # α of the last update, (...)
+    step_size: FloatArray  # α at the last update, (...)
 
 
 @final
@@ -200,34 +215,35 @@ class RbfnnLaw(Law[RbfnnState]):
         Raises:
             ValueError: a preview shorter than the horizon.
         """
-        spec, network = knowledge.spec, replace(networks.controller, offset_free=config.offset_free)
+        spec = knowledge.spec
+        network = replace(networks.controller, offset_free=config.offset_free)
+        self.owns = frozenset()
         if config.preview:
-            check_preview(
-                config.horizon * network.step, knowledge.preview, spec.period, "the law's horizon"
-            )
+            reach = config.horizon * network.step
+            check_preview(reach, knowledge.preview, spec.period, "the law's horizon")
+            self.owns = frozenset({"preview"})
         self._config = config
         self._network = network
-        self.owns = frozenset({"preview"}) if config.preview else frozenset()
-        self._period, self._step = spec.period, network.step
+        self._period = spec.period
+        self._step = network.step
         self._step_limit = spec.joint_velocity_limit * network.step
         self._share = update_share(config.k, spec.period, network.step)
         rate = in_periods(network.step, spec.period)
         self._preview_places = rate * np.arange(config.horizon + 1.0)
         self._error_places = rate * np.arange(float(network.error_history))
         self._position_places = rate * np.arange(float(network.position_history))
-        self._rows = [
-            1 + math.ceil(float(places[-1]))
-            for places in (self._error_places, self._position_places)
-        ]
+        self._error_rows = 1 + math.ceil(float(self._error_places[-1]))
+        self._position_rows = 1 + math.ceil(float(self._position_places[-1]))
 
     def start(self, observation: Observation) -> RbfnnState:
         """Return the state of the offline network."""
-        network, lead, q = self._network, observation.feature.shape[:-1], observation.joint_position
-        errors, positions = self._rows
+        network = self._network
+        lead = observation.feature.shape[:-1]
+        q = observation.joint_position
         return RbfnnState(
             learned=np.zeros((*lead, *network.weights.shape)),
-            errors=np.full((*lead, errors, network.m), np.nan),
-            positions=np.repeat(q[..., None, :], positions, axis=-2),
+            errors=np.full((*lead, self._error_rows, network.m), np.nan),
+            positions=np.repeat(q[..., None, :], self._position_rows, axis=-2),
             predicted=np.zeros((*lead, self._config.horizon, network.m)),
             step_size=np.zeros(lead),
         )
@@ -236,24 +252,26 @@ class RbfnnLaw(Law[RbfnnState]):
         self, state: RbfnnState, estimate: Estimate, observation: Observation, reference: FloatArray
     ) -> tuple[RbfnnState, FloatArray]:
         """Return the new state and u, (..., n), rad/s; see `Law.command`."""
-        config, jacobian, learned = self._config, estimate.jacobian, state.learned
+        config = self._config
+        jacobian = estimate.jacobian
         errors = pushed(state.errors, reference[..., 0, :] - observation.feature)
-        begins = np.isnan(errors[..., -1, 0])  # the first error fills its history
-        errors = branch(
-            begins, lambda first: np.repeat(first[..., :1, :], self._rows[0], axis=-2), errors
-        )
+        # The first error fills its history.
+        begins = np.isnan(errors[..., -1, 0])
+        errors = branch(begins, self._filled, errors)
         positions = state.positions
         if config.position == "measured":
             positions = pushed(positions, observation.joint_position)
+        learned = state.learned
         if config.row_space_only:
             learned = project_to_row_space(learned, jacobian)
-        weights, steps = self._network.weights + learned, self._reference_steps(reference)
-        history = sampled(errors, self._error_places), sampled(positions, self._position_places)
+        weights = self._network.weights + learned
+        steps = self._reference_steps(reference)
+        history = (sampled(errors, self._error_places), sampled(positions, self._position_places))
         ahead = roll_out(self._network, weights, jacobian, history, steps, self._step_limit)
         direction = descent_direction(jacobian, ahead)
         alpha, wanted = self._update(direction, ahead, observation.feature_valid)
         direction *= alpha[..., None, None, None]
-        # Weights are large: no array more than is needed
+        # Weights are large: the update goes into the array of the direction, and no further one is made.
         learned = np.add(learned, direction, out=direction)
         alpha = np.where(observation.feature_valid, alpha, state.step_size)[()]
         new = RbfnnState(learned, errors, positions, ahead.errors, alpha)
@@ -270,15 +288,18 @@ class RbfnnLaw(Law[RbfnnState]):
 
     def diagnostics(self, state: RbfnnState) -> Diagnostics:
         """Return I_c = ½ Σ ‖e(k+t)‖² (eq. 15, m²), step size α, ‖e(k+T)‖ (m), norms of weights."""
+        weights = self._network.weights + state.learned
         return {
             "criterion": 0.5 * sum_of_squares(state.predicted, 2),
             "step_size": state.step_size,
             "predicted_error": norm(state.predicted[..., -1, :]),
-            "controller_weight_norm": np.sqrt(
-                sum_of_squares(self._network.weights + state.learned, 3)
-            ),
+            "controller_weight_norm": np.sqrt(sum_of_squares(weights, 3)),
             "learned_weight_norm": np.sqrt(sum_of_squares(state.learned, 3)),
         }
+
+    def _filled(self, errors: FloatArray) -> FloatArray:
+        """Return a history of which every error is the newest one."""
+        return np.repeat(errors[..., :1, :], self._error_rows, axis=-2)
 
     def _reference_steps(self, reference: FloatArray) -> FloatArray:
         """Return the assumed steps of the reference in the T steps of the horizon, (..., T, m), m."""
@@ -301,9 +322,8 @@ class RbfnnLaw(Law[RbfnnState]):
         if self._config.anti_windup:
             renewed = ahead.wanted + alpha[..., None] * push
             before = largest_excess(ahead.wanted, self._step_limit)
-            alpha = alpha * (
-                (before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before)
-            )
+            after = largest_excess(renewed, self._step_limit)
+            alpha = alpha * ((before <= 1.0) | (after <= before))
         return alpha, ahead.wanted + alpha[..., None] * push
 
 
@@ -321,4 +341,6 @@ def update_share(k: float, period: float, step: float) -> float:
         loop's delay only, and where a period is longer than the step, updates that do not wait for it add up.
     """
     steps = in_periods(period, step)
-    return min(-math.expm1(steps * math.log1p(-k)) if k < 1.0 else k * steps, k)
+    if k >= 1.0:
+        return min(k * steps, k)
+    return min(-math.expm1(steps * math.log1p(-k)), k)

@@ -26,7 +26,8 @@ import numpy as np
 from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
 
-_SERIES_BELOW = 0.5  # below, the series of 18 terms is exact to rounding; above, the closed form
+# Below this s the series of 18 terms is exact to rounding; above it the closed form is.
+_SERIES_BELOW = 0.5
 _SERIES_TERMS = 18
 _MIN_POWER = 1e-150  # [1] smaller weights count as 0, so that products with them do not underflow
 REFERENCE_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
@@ -61,7 +62,8 @@ def _weighted_power_integral(power: int, rate: float, horizon: float) -> float:
     """∫₀ᴴ τ^p exp(−rate τ) dτ for p = 1 or 2."""
     s = rate * horizon
     if s < _SERIES_BELOW:
-        term, total = 1.0, 0.0
+        term = 1.0
+        total = 0.0
         for k in range(_SERIES_TERMS):
             total += term / (power + k + 1)
             term *= -s / (k + 1)
@@ -115,7 +117,8 @@ def preview_weights(horizon: int, alpha: float) -> FloatArray:
     x = 0.5 * (_NODES + 1.0)
     for start in range(horizon):
         tau = start + x
-        density = 0.5 * _NODE_WEIGHTS * tau * np.array([_power(alpha, t) for t in tau.tolist()])
+        powers = np.array([_power(alpha, t) for t in tau.tolist()])
+        density = 0.5 * _NODE_WEIGHTS * tau * powers
         v[start] += density @ (1.0 - x)
         v[start + 1] += density @ x
     return v[1:]
@@ -151,7 +154,9 @@ class UnlimitedPlan:
         eigenvalues, U = np.linalg.eigh(coupling)
         self._move_weight = move_weight
         self._eigenvalues = np.maximum(eigenvalues, 0.0)[:, None]
-        self._forth, self._back = U.T @ pull, np.concatenate([U, travel @ U])
+        self._forth = U.T @ pull
+        # One product gives dq above S.
+        self._back = np.concatenate([U, travel @ U])
 
     @classmethod
     def of_free_moves(cls, weights: FloatArray, move_weight: FloatArray) -> UnlimitedPlan:
@@ -187,9 +192,9 @@ class UnlimitedPlan:
         weighted = J / self._move_weight
         s, V = np.linalg.eigh(weighted @ J.mT)
         along = self._forth @ targets @ V / (1.0 + self._eigenvalues * s[..., None, :])
-        both = self._back @ (along @ (V.mT @ weighted))
+        stacked = self._back @ (along @ (V.mT @ weighted))
         moves = len(self._forth)
-        return both[..., :moves, :], both[..., moves:, :]
+        return stacked[..., :moves, :], stacked[..., moves:, :]
 
 
 @dataclass(frozen=True)
@@ -204,7 +209,7 @@ class Blocks:
 
     count: int  # B
     length: float  # Δ [s]
-    period: float  # of control [s]
+    period: float  # control period [s]
 
     @classmethod
     def of(cls, horizon_time: float, moves: int, period: float) -> Blocks:
@@ -226,11 +231,10 @@ class Blocks:
         """Return the places in a preview of the beginning of the first block and the ends of all, (B + 1,), in rows.
 
         Args:
-            delay: from now to the begin of the first block [s].
+            delay: from now to the beginning of the first block [s].
         """
-        return np.array(
-            [in_periods(delay + t * self.length, self.period) for t in range(self.count + 1)]
-        )
+        times = [delay + t * self.length for t in range(self.count + 1)]
+        return np.array([in_periods(time, self.period) for time in times])
 
 
 def bridging_shares(delay: float, period: float) -> FloatArray:

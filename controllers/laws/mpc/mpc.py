@@ -1,9 +1,11 @@
 """Model predictive control with a frozen Jacobian: eq. 46 generalised to free moves, preview and limits."""
 
 import math
+from collections.abc import Callable
 from typing import Final, Literal, NamedTuple, final
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law, Stage
@@ -32,7 +34,7 @@ from servobench.plant.contract.signals import BoolArray, Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
 _MAX_FORGETTING: Final = 20.0  # [1] a block, after which an error weighs 2e-9 of the present one
-_MIN_ROOM: Final = 1e-12  # [rad/s] of a joint whose command is at the acceleration limit
+_MIN_ROOM: Final = 1e-12  # [rad/s] room of a joint whose command is at the acceleration limit
 
 
 @settings
@@ -94,9 +96,9 @@ class MpcState(NamedTuple):
     last: FloatArray  # (..., n), rad, the last step sent
     fallbacks: FloatArray  # (...), commands without a solution so far
     J: FloatArray  # (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two
-    targets: FloatArray  # (..., moves, m), of the last command
+    targets: FloatArray  # (..., moves, m), targets of the last command
     final: FloatArray  # (..., m), m, error at the end of the horizon if the arm stood still
-    plan: Plan  # of the last command
+    plan: Plan  # plan of the last command
 
 
 @final
@@ -146,57 +148,57 @@ class MpcLaw(Law[MpcState]):
         if config.view_tangent and spec.m != 3:
             raise ValueError(f"view_tangent needs the 3 features x, y, z, got {spec.m} features")
         if config.forgetting * blocks.length > _MAX_FORGETTING:
-            most = (
-                f"at most {_MAX_FORGETTING / blocks.length:g} 1/s for blocks of {blocks.length:g} s"
-            )
+            most = _MAX_FORGETTING / blocks.length
             raise ValueError(
-                f"forgetting must be {most}, or no error ahead counts; got {config.forgetting:g} 1/s"
+                f"forgetting must be at most {most:g} 1/s for blocks of {blocks.length:g} s, or no error ahead counts; "
+                f"got {config.forgetting:g} 1/s"
             )
-        self._config, self._spec, self._blocks = config, spec, blocks
-        own: dict[Stage, bool] = {
-            "limit": True,
-            "preview": config.use_preview,
-            "predict": config.delay > 0.0,
-        }
-        self.owns = frozenset(stage for stage, brought in own.items() if brought)
+        self._config = config
+        self._spec = spec
+        self._blocks = blocks
+        self.owns = _owned_stages(config)
         self._places = blocks.places(config.delay)
         self._to_come = closed_form.bridging_shares(config.delay, spec.period)[:, None]
-        constant, horizon = config.mode == "constant", blocks.count
-        weight = as_array("joint_weight", config.joint_weight or np.ones(spec.n), (spec.n,))
+
+        constant = config.mode == "constant"
+        horizon = blocks.count
+        joint_weight = as_array("joint_weight", config.joint_weight or np.ones(spec.n), (spec.n,))
         # One constant velocity is weighted once, not in every block.
-        self._Q: FloatArray = (
-            config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
-        )
+        power = 3 if constant else 2
+        self._Q: FloatArray = config.move_weight / blocks.relative_length**power * joint_weight
         self._terminal = config.terminal_weight / blocks.relative_length
-        rho, alpha = config.decay * blocks.length, math.exp(-config.forgetting * blocks.length)
+
+        rho = config.decay * blocks.length
+        alpha = math.exp(-config.forgetting * blocks.length)
         self._shares = closed_form.decay_shares(horizon, rho)
         self._integrals = closed_form.horizon_integrals(horizon, alpha, rho)
         self._preview_weights = closed_form.preview_weights(horizon, alpha)
         weights = closed_form.move_weights(horizon, alpha, self._terminal)
         gain = self._integrals.a + self._terminal * horizon**2
+
         self._change: FloatArray = np.full(spec.n, config.joint_acceleration_limit * blocks.length)
+        limited = math.isfinite(config.joint_acceleration_limit)
         self._shape = QpShape(
             weights=weights,
             move_weight=self._Q,
             constant_gain=gain if constant else None,
             largest_move=spec.joint_velocity_limit * blocks.length,
-            largest_change=self._change * blocks.length
-            if math.isfinite(config.joint_acceleration_limit)
-            else None,
+            largest_change=self._change * blocks.length if limited else None,
             limit_position=config.limit_position,
             view_rows=view_rows(config.view_tangent, spec.m),
         )
-        self._unlimited = (
-            closed_form.UnlimitedPlan.of_constant_step(gain, horizon, self._Q)
-            if constant
-            else closed_form.UnlimitedPlan.of_free_moves(weights, self._Q)
-        )
+        if constant:
+            self._unlimited = closed_form.UnlimitedPlan.of_constant_step(gain, horizon, self._Q)
+        else:
+            self._unlimited = closed_form.UnlimitedPlan.of_free_moves(weights, self._Q)
         self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
 
     def start(self, observation: Observation) -> MpcState:
         """Return the state of an arm at rest."""
-        lead, shape = observation.feature.shape[:-1], self._shape
-        n, m, moves = self._spec.n, self._spec.m, shape.moves
+        lead = observation.feature.shape[:-1]
+        n = self._spec.n
+        m = self._spec.m
+        moves = self._shape.moves
         unknown = np.full(lead, np.nan)
         return MpcState(
             sent=np.zeros((*lead, len(self._to_come), n)),
@@ -222,15 +224,15 @@ class MpcLaw(Law[MpcState]):
         moves, travel = self._unlimited.minimise(J, targets)
         # A ball that is out of view already may not get further out.
         margin = np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0)
-        last = state.last * self._blocks.periods, self._change * self._spec.period
+        last = (state.last * self._blocks.periods, self._change * self._spec.period)
         bounds = joint_bounds(self._shape, self._spec, last, observation.joint_position, margin)
         lead = feature.shape[:-1]
         plan = Plan(
             moves, success=np.ones(lead), iterations=np.zeros(lead), active_limits=np.zeros(lead)
         )
-        plan = branch(
-            exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds
-        )
+        # Only where the optimum without limits exceeds one is the program solved.
+        beyond = exceeds(self._shape, bounds, J, moves, travel)
+        plan = branch(beyond, self._limited, plan, J, targets, bounds)
         limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan.moves[..., 0, :] / self._blocks.length, -limit, limit)
         fallbacks = np.asarray(state.fallbacks + (1.0 - plan.success))
@@ -243,30 +245,29 @@ class MpcLaw(Law[MpcState]):
         """Return the velocity with as much of the stages' addition as the acceleration limit leaves room for."""
         if self._shape.largest_change is None:
             return joint_velocity
-        added, period = joint_velocity - wanted, self._spec.period
-        change = self._config.joint_acceleration_limit * period - np.sign(added) * (
-            wanted - state.last / period
-        )
-        return wanted + scale_to_limit(added, np.maximum(change, _MIN_ROOM))
+        period = self._spec.period
+        added = joint_velocity - wanted
+        # The command has changed by `so_far` already; an addition in the same direction has less room.
+        so_far = wanted - state.last / period
+        limit = self._config.joint_acceleration_limit * period
+        room = limit - np.sign(added) * so_far
+        return wanted + scale_to_limit(added, np.maximum(room, _MIN_ROOM))
 
     def noted(self, state: MpcState, joint_velocity: FloatArray, limited: BoolArray) -> MpcState:
         """Return the state with the step that is sent; see `Law.noted`."""
         last = joint_velocity * self._spec.period
-        return state._replace(
-            sent=np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :], last=last
-        )
+        sent = np.concatenate([state.sent, last[..., None, :]], axis=-2)
+        return state._replace(sent=sent[..., 1:, :], last=last)
 
     def _look_ahead(
         self, sent: FloatArray, J: FloatArray, observation: Observation, reference: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return ŷ, e and r_1 … r_H, all at the instant when a command first acts."""
-        feature = observation.feature + np.matvec(J, np.add.reduce(self._to_come * sent, axis=-2))
+        to_come = np.add.reduce(self._to_come * sent, axis=-2)
+        feature = observation.feature + np.matvec(J, to_come)
         if not self._config.use_preview:
-            return (
-                feature,
-                reference[..., 0, :] - feature,
-                np.zeros((self._blocks.count, self._spec.m)),
-            )
+            error = reference[..., 0, :] - feature
+            return feature, error, np.zeros((self._blocks.count, self._spec.m))
         rows = sampled(reference, self._places)
         return feature, rows[..., 0, :] - feature, rows[..., 1:, :] - rows[..., :1, :]
 
@@ -275,12 +276,13 @@ class MpcLaw(Law[MpcState]):
 
         Without an active limit the plan is that of the closed form, after no iteration.
         """
-        plan, moves = state.plan, state.plan.moves
-        travel = moves.sum(axis=-2) * (self._blocks.count / self._shape.moves)
+        plan = state.plan
+        travel = plan.moves.sum(axis=-2) * (self._blocks.count / self._shape.moves)
+        objective = where(plan.success > 0.0, self._objective(state), np.asarray(math.nan))
         return {
             "solver_success": plan.success,
             "solver_iterations": plan.iterations,
-            "objective": where(plan.success > 0.0, self._objective(state), np.asarray(math.nan)),
+            "objective": objective,
             "fallbacks": state.fallbacks,
             "active_limits": plan.active_limits,
             "predicted_terminal_error": norm(state.final - np.matvec(state.J, travel)),
@@ -288,34 +290,35 @@ class MpcLaw(Law[MpcState]):
 
     def _objective(self, state: MpcState) -> FloatArray:
         """Return the criterion of the plan, (...), m²."""
-        shape, moves, J, targets = self._shape, state.plan.moves, state.J, state.targets
+        shape = self._shape
+        moves = state.plan.moves
+        J = state.J
         effort = 0.5 * (self._Q * moves**2).sum(axis=(-2, -1))
         if shape.constant_gain is not None:
             step = moves @ J.mT
-            return np.asarray(
-                effort + (0.5 * shape.constant_gain * step**2 - targets * step).sum(axis=(-2, -1))
-            )
-        miss = targets - np.cumsum(moves, axis=-2) @ J.mT
-        return np.asarray(effort + 0.5 * (shape.weights[:, None] * miss**2).sum(axis=(-2, -1)))
+            criterion = 0.5 * shape.constant_gain * step**2 - state.targets * step
+            return np.asarray(effort + criterion.sum(axis=(-2, -1)))
+        miss = state.targets - np.cumsum(moves, axis=-2) @ J.mT
+        misses = (shape.weights[:, None] * miss**2).sum(axis=(-2, -1))
+        return np.asarray(effort + 0.5 * misses)
 
     def _program_targets(self, error: FloatArray, ahead: FloatArray) -> FloatArray:
         """Return the targets of the program, (..., H, m) m, or integrated over the horizon, (..., 1, m)."""
         targets = closed_form.decay_targets(error, ahead, self._shares)
         if self._config.mode == "moves":
             return targets
-        integral = (self._integrals.b - self._integrals.c) * error + np.vecmat(
-            self._preview_weights, ahead
-        )
+        _, b, c = self._integrals
+        integral = (b - c) * error + np.vecmat(self._preview_weights, ahead)
         terminal = self._terminal * self._blocks.count * targets[..., -1, :]
         return np.asarray((integral + terminal)[..., None, :])
 
     def _limited(self, plan: Plan, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> Plan:
         """Return the best plan within the limits."""
-        signature = "(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()"
-        # numpy.vectorize takes one lane after the other
-        solve = (
-            self._solve if plan.moves.ndim == 2 else np.vectorize(self._solve, signature=signature)
-        )
+        solve: Callable[..., tuple[npt.ArrayLike, ...]] = self._solve
+        if plan.moves.ndim > 2:
+            # numpy.vectorize takes one lane after the other.
+            signature = "(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()"
+            solve = np.vectorize(self._solve, signature=signature)
         return Plan(*map(np.asarray, solve(plan.moves, J, targets, *bounds)))
 
     def _solve(
@@ -326,8 +329,17 @@ class MpcLaw(Law[MpcState]):
         if solution.success:
             active = np.count_nonzero(np.abs(solution.multiplier) > _MIN_MULTIPLIER)
             return solution.moves, 1.0, solution.iterations, float(active)
-        hold = self._config.fallback == "hold"
-        step = (
-            np.zeros(self._spec.n) if hold else scale_to_limit(moves[0], self._shape.largest_move)
-        )
+        step = np.zeros(self._spec.n)
+        if self._config.fallback != "hold":
+            step = scale_to_limit(moves[0], self._shape.largest_move)
         return np.tile(step, (len(moves), 1)), 0.0, solution.iterations, math.nan
+
+
+def _owned_stages(config: MpcConfig) -> frozenset[Stage]:
+    """Return the stages of the chain that the law brings itself with these settings."""
+    stages: list[Stage] = ["limit"]
+    if config.use_preview:
+        stages.append("preview")
+    if config.delay > 0.0:
+        stages.append("predict")
+    return frozenset(stages)
