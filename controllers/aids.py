@@ -32,9 +32,8 @@ class Switch:
     """Declares a setting that switches an aid; its default leaves the aid out."""
 
     equipped: object  # its value in a best equipped method
-    tuned: tuple[
-        object, ...
-    ] = ()  # the values among which tuning chooses; empty where tuning has no choice
+    # the values among which tuning chooses; empty where tuning has no choice
+    tuned: tuple[object, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,12 +104,12 @@ class AidsConfig:
 def _marked(mark: type[Mark]) -> dict[str, Mark]:
     """Return the declarations of this type by setting, in the order of the settings."""
     hints = get_type_hints(AidsConfig, include_extras=True)
-    return {
-        key: each
-        for key, hint in hints.items()
-        for each in getattr(hint, "__metadata__", ())
-        if isinstance(each, mark)
-    }
+    marked = {}
+    for key, hint in hints.items():
+        for each in getattr(hint, "__metadata__", ()):
+            if isinstance(each, mark):
+                marked[key] = each
+    return marked
 
 
 SWITCHES: Final[Mapping[str, Switch]] = _marked(Switch)
@@ -143,12 +142,16 @@ EQUIPPED: Final[Mapping[str, Any]] = _Fixed(
 def describe_aids(values: Mapping[str, Any]) -> str:
     """Return which aids a controller has by its settings, whose keys have dots: with all, without, with some."""
     none = AidsConfig()
-    on = [
-        name
-        for name in SWITCHES
-        if values.get(f"aids.{name}", getattr(none, name)) != getattr(none, name)
-    ]
+    on = []
+    for name in SWITCHES:
+        default = getattr(none, name)
+        if values.get(f"aids.{name}", default) != default:
+            on.append(name)
     off = [name for name in SWITCHES if name not in on]
+    if not on:
+        return "without aids"
+    if not off:
+        return "with all aids"
     if len(on) < len(off):
-        return f"with the aids {', '.join(on)} alone" if on else "without aids"
-    return f"with all aids{' but ' * bool(off)}{', '.join(off)}"
+        return f"with the aids {', '.join(on)} alone"
+    return f"with all aids but {', '.join(off)}"

@@ -6,10 +6,11 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import branch, plus_diagonal
 
-MAX_DAMPED_RATIO = 1e9  # [1] of ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
-MIN_SINGULAR_RATIO = (
-    1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors
+MAX_DAMPED_RATIO = (
+    1e9  # [1] largest ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
 )
+# [1] Ratio of a singular value to the largest one, below which it is a rounding error.
+MIN_SINGULAR_RATIO = 1e-15
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
@@ -27,6 +28,7 @@ def nearest_rotation(M: FloatArray) -> FloatArray:
 
 
 def _reflected(R: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the product with the sign of the smallest singular value changed, so that the determinant is 1."""
     signs = np.ones(R.shape[-1])
     signs[-1] = -1.0
     return np.asarray((left * signs) @ right)
@@ -57,12 +59,14 @@ def _solve_normal_equations(J: FloatArray, square: FloatArray, damping: float) -
 def _decompose(_: FloatArray, J: FloatArray, damping: float) -> FloatArray:
     """Return (JJᵀ + δ²I)⁻¹ J, (..., m, n), from singular values."""
     U, sigma, Vt = np.linalg.svd(J, full_matrices=False)
-    return np.asarray((U * (sigma / (sigma**2 + damping**2))[..., None, :]) @ Vt)
+    inverse = sigma / (sigma**2 + damping**2)
+    return np.asarray((U * inverse[..., None, :]) @ Vt)
 
 
 def project_to_row_space(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
     """Return Ĵ⁺Ĵ W: the part of weights (..., n, p, N_h) whose output moves the feature under Ĵ (..., m, n)."""
     _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
-    basis = rows * (singular > MIN_SINGULAR_RATIO * singular[..., :1])[..., None]
+    counts = singular > MIN_SINGULAR_RATIO * singular[..., :1]
+    basis = rows * counts[..., None]
     flat = weights.reshape(*weights.shape[:-2], -1)
     return np.asarray(basis.mT @ (basis @ flat)).reshape(weights.shape)

@@ -28,7 +28,7 @@ Diagnostics: TypeAlias = Mapping[str, npt.ArrayLike]
 class Delays:
     """Delays of commands and features."""
 
-    latency: float  # s, of the camera
+    latency: float  # s, from an exposure of the camera to its feature
     command_delay: float  # s, from a command to its first effect
     lag: float  # s, time constant of the joints' velocity loops
     latency_spread: float = 0.0  # s, by which a frame may be later than the latency
@@ -80,7 +80,8 @@ class RobotKnowledge:
                 raise ValueError(f"observation.{name} must have shape {(size,)}, got {shape}")
         if reference is None:
             return
-        wanted, shape = (1 + self.preview, self.spec.m), np.shape(reference)
+        wanted = (1 + self.preview, self.spec.m)
+        shape = np.shape(reference)
         if shape != wanted:
             raise ValueError(
                 f"reference must have shape {wanted} for a preview of {self.preview}, got {shape}"

@@ -22,7 +22,10 @@ from servobench.plant.contract.lanes import branch, pick
 from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
-MIN_FEATURES: Final = 3  # that end a rest after its time where frames are lost or slow
+MIN_FEATURES: Final = (
+    3  # number of features that end a rest after its time where frames are lost or slow
+)
+MIN_MOVED_SHARE: Final = 0.1  # [1] least singular value of ΔQ in probing moves
 State = TypeVar("State")
 IntArray = npt.NDArray[np.int_]
 
@@ -61,11 +64,9 @@ class InitialJacobian(ABC, Generic[State]):
 
     def step(self, state: State, observation: Observation) -> tuple[State, FloatArray, BoolArray]:
         """Return the new state, a velocity (..., n) [rad/s] of a probing move, and whether Ĵ₀ is known now, (...)."""
-        return (
-            state,
-            np.zeros_like(observation.joint_position),
-            np.full(observation.feature.shape[:-1], True),
-        )
+        velocity = np.zeros_like(observation.joint_position)
+        known = np.full(observation.feature.shape[:-1], True)
+        return state, velocity, known
 
     @abstractmethod
     def jacobian(self, state: State) -> FloatArray:
@@ -128,10 +129,9 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         """
         self._config = config
         self._spec = spec
-        times = config.probe_time, config.settle_time, config.average_time
-        self._move, self._settle, self._rest = (
-            ceil(in_periods(time, spec.period)) for time in times
-        )
+        self._move = ceil(in_periods(config.probe_time, spec.period))
+        self._settle = ceil(in_periods(config.settle_time, spec.period))
+        self._rest = ceil(in_periods(config.average_time, spec.period))
         self.duration = self._rest + spec.n * (self._move + self._settle + self._rest - 1)
         self._speed = config.probe_step / (self._move * spec.period)
         slowest = float(spec.joint_velocity_limit.min())
@@ -143,12 +143,15 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             )
         narrowest = float((spec.joint_upper - spec.joint_lower).min())
         if 2.0 * config.probe_step > narrowest:
-            half = f"half the joint range of {narrowest:g} rad"
-            raise ValueError(f"probe_step must be at most {half}, got {config.probe_step:g}")
+            raise ValueError(
+                f"probe_step must be at most half the joint range of {narrowest:g} rad, got {config.probe_step:g}"
+            )
 
     def start(self, observation: Observation) -> ProbeState:
         """Return the state at the first rest, which is the start of the run."""
-        lead, (m, n) = observation.feature.shape[:-1], (self._spec.m, self._spec.n)
+        lead = observation.feature.shape[:-1]
+        n = self._spec.n
+        m = self._spec.m
         return ProbeState(
             rests=np.zeros(lead, dtype=np.int_),
             rest_positions=np.zeros((*lead, n + 1, n)),
@@ -164,23 +167,24 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         self, state: ProbeState, observation: Observation
     ) -> tuple[ProbeState, FloatArray, BoolArray]:
         """Return the velocity of the probing move, zero while resting or done, and whether all joints have moved."""
-        config, n = self._config, self._spec.n
+        n = self._spec.n
         rested = state.phase - state.rest_begins - self._settle
         state = branch((rested >= 0) & observation.feature_valid, self._gather, state, observation)
+        # Where frames are lost, a rest goes on after its time until there are a few features.
         enough = np.where(rested + 1 < self._rest, self._rest, min(self._rest, MIN_FEATURES))
         state = branch(state.gathered >= enough, self._end_rest, state)
         done = state.rests == n + 1
-        joint = np.minimum(state.rests, n) - 1
+
         moves = (state.phase < state.rest_begins) & ~done
+        joint = np.minimum(state.rests, n) - 1
         chosen = np.arange(n) == np.asarray(joint)[..., None]
+        # A joint without room above moves downwards.
         last = pick(state.rest_positions, joint)
-        room = ((last + config.probe_step <= self._spec.joint_upper) & chosen).any(axis=-1)
+        fits = last + self._config.probe_step <= self._spec.joint_upper
+        room = (fits & chosen).any(axis=-1)
         speed = np.where(room, self._speed, -self._speed) * moves
-        return (
-            state._replace(phase=state.phase + 1),
-            np.asarray(chosen * np.asarray(speed)[..., None]),
-            done,
-        )
+        velocity = np.asarray(chosen * np.asarray(speed)[..., None])
+        return state._replace(phase=state.phase + 1), velocity, done
 
     def _gather(self, state: ProbeState, observation: Observation) -> ProbeState:
         return state._replace(
@@ -190,7 +194,9 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         )
 
     def _end_rest(self, state: ProbeState) -> ProbeState:
-        zero, count = np.zeros_like(state.phase), np.asarray(state.gathered)[..., None]
+        """Return the state in which the present rest is over and its means are kept."""
+        zero = np.zeros_like(state.phase)
+        count = np.asarray(state.gathered)[..., None]
         return state._replace(
             rest_positions=_with_entry(state.rest_positions, state.rests, state.positions / count),
             rest_features=_with_entry(state.rest_features, state.rests, state.features / count),
@@ -208,8 +214,11 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         Raises:
             ControllerDiverged: a joint did not move, so its column is unknown.
         """
-        Q, Y = np.diff(state.rest_positions, axis=-2), np.diff(state.rest_features, axis=-2)
-        if (np.linalg.svd(Q, compute_uv=False)[..., -1] < 0.1 * self._config.probe_step).any():
+        # Rows of Q and Y are ΔQᵀ and ΔYᵀ.
+        Q = np.diff(state.rest_positions, axis=-2)
+        Y = np.diff(state.rest_features, axis=-2)
+        smallest = np.linalg.svd(Q, compute_uv=False)[..., -1]
+        if (smallest < MIN_MOVED_SHARE * self._config.probe_step).any():
             raise ControllerDiverged(
                 f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
@@ -228,7 +237,8 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
     Raises:
         ValueError: the nominal Jacobian is wanted where no model exists, or settings that do not fit the plant.
     """
-    spec, model = knowledge.spec, knowledge.nominal_jacobian
+    spec = knowledge.spec
+    model = knowledge.nominal_jacobian
     if config.source == "probe":
         return ProbedJacobian(config, spec)
     if config.source == "given":

@@ -141,9 +141,8 @@ class Method:
     summary: str  # one line for `servobench controllers`
     # settings of the law that differ from its own defaults
     law_defaults: Mapping[str, object] = field(default_factory=dict)
-    aids: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # settings of the aids that differ from none
+    # settings of the aids that differ from none
+    aids: Mapping[str, Any] = field(default_factory=dict)
     # settings of the law as published that differ from its own defaults; None: it is not published
     printed: Mapping[str, object] | None = None
     # settings of the estimator that differ from its own defaults where there are aids
@@ -164,8 +163,12 @@ class Method:
     def config(self) -> MethodConfig:
         """Return the default settings."""
         law, estimator = self._parts()
-        parts = estimator.config(**self.estimator_defaults), law.config(**self.law_defaults)
-        settings = *parts, InitialConfig(), AidsConfig(**self.aids)
+        settings = (
+            estimator.config(**self.estimator_defaults),
+            law.config(**self.law_defaults),
+            InitialConfig(),
+            AidsConfig(**self.aids),
+        )
         if law.trained or estimator.trained:
             training = TrainingConfig(controller=ControllerTraining(**self.network_defaults))
             return TrainedMethodConfig(*settings, training)
@@ -175,14 +178,14 @@ class Method:
         """Return the controller for these settings and this robot; its parts see features in natural units."""
         law, estimator = self._parts()
         knowledge = in_natural_units(knowledge)
-        networks = (
-            [obtain_networks(config.training, knowledge)]
-            if isinstance(config, TrainedMethodConfig)
-            else []
-        )
+        networks = []
+        if isinstance(config, TrainedMethodConfig):
+            networks.append(obtain_networks(config.training, knowledge))
+        estimator_networks = networks if estimator.trained else []
+        law_networks = networks if law.trained else []
         servo = Servo(
-            estimator.make(config.estimator, knowledge, *(networks if estimator.trained else ())),
-            law.make(config.law, knowledge, *(networks if law.trained else ())),
+            estimator.make(config.estimator, knowledge, *estimator_networks),
+            law.make(config.law, knowledge, *law_networks),
             initial_jacobian(config.initial, knowledge),
             knowledge,
             config.aids,
@@ -201,21 +204,20 @@ class Method:
         )
 
     def _parts(self) -> tuple[Part[Any], Part[Any]]:
-        for kind, name, known in (
-            ("law", self.law, list(LAWS)),
-            ("estimator", self.estimator, list(ESTIMATORS)),
-        ):
-            if name not in known:
-                hint = did_you_mean(name, known)
-                raise ValueError(
-                    f"{kind} must be one of {', '.join(sorted(known))}, got {name!r}{hint}"
-                )
+        _check_name("law", self.law, LAWS)
+        _check_name("estimator", self.estimator, ESTIMATORS)
         return LAWS[self.law], ESTIMATORS[self.estimator]
 
 
-# Which it brings itself
-_OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}
-_GIVEN = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
+def _check_name(kind: str, name: str, known: Mapping[str, Part[Any]]) -> None:
+    if name not in known:
+        hint = did_you_mean(name, list(known))
+        raise ValueError(f"{kind} must be one of {', '.join(sorted(known))}, got {name!r}{hint}")
+
+
+# The predictive law brings a preview and limits itself.
+_MPC_AIDS = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}
+_GIVEN_DELAYS = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
 _PRINTED_MPC = {"mode": "constant", "use_preview": False, "limit_position": False}
 
 # Methods best equipped, and as published with the law's defaults
@@ -236,16 +238,16 @@ _ROWS = (
     _both("ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)"),
     Method(
         "ukf_mpc", "mpc", "ukf", "unscented Kalman filter with model predictive control (eq. 46)",
-        {}, _OF_MPC, printed=_PRINTED_MPC,
+        {}, _MPC_AIDS, printed=_PRINTED_MPC,
     ),
     _both(
         "rbf_pid", "pid", "rbf_lyapunov",
         "Jacobian network under a Lyapunov update with the pseudo-inverse law (eqs. 40-43)",
     ),
-    Method("constant", "pid", "constant", "pseudo-inverse of the first Jacobian for ever: the lower bound"),
+    Method("constant", "pid", "constant", "pseudo-inverse of the unchanged first Jacobian: the lower bound"),
     Method(
         "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian with the true delays: a bound of its law",
-        {}, _GIVEN,
+        {}, _GIVEN_DELAYS,
     ),
     _both("broyden", "pid", "broyden", "Broyden's rank-one update with the pseudo-inverse law"),
     _both("rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law"),
@@ -277,11 +279,14 @@ def suggest_pair(name: str) -> str:
     """Return the advice for the name of a law or an estimator given as that of a controller; empty for others."""
     if name not in {*LAWS, *ESTIMATORS}:
         return ""
-    is_law = name in LAWS
-    pair = f"{name}+ukf" if is_law else f"mfac+{name}"
+    kind = "an estimator"
+    pair = f"mfac+{name}"
+    if name in LAWS:
+        kind = "a law"
+        pair = f"{name}+ukf"
     methods = [method for method in METHODS if name in re.split("[_:]", method)]
     ready = f"; methods with it: {', '.join(methods)}" if methods else ""
-    return f"it is {'a law' if is_law else 'an estimator'} and makes a pair, such as {pair}{ready}"
+    return f"it is {kind} and makes a pair, such as {pair}{ready}"
 
 
 @final
@@ -292,9 +297,10 @@ class OwnLaw(Law[None]):
         self, make: Callable[[RobotKnowledge], Controller], given: RobotKnowledge, aids: AidsConfig
     ) -> None:
         """Make the controller with its knowledge of a robot, in the unit of the plant."""
-        # Which is corrected
+        # The nominal Jacobian that is corrected by the estimate; None where the controller gets it as it is.
         self._nominal = None if aids.model == "own" else given.nominal_jacobian
-        self._unit, self.seed = given.spec.feature.scale, 0
+        self._unit = given.spec.feature.scale
+        self.seed = 0
         self._correction: FloatArray | float = 0.0
         self._rows = 1 if aids.feedforward else 1 + given.preview
         model = given.nominal_jacobian if self._nominal is None else self._jacobian
@@ -312,9 +318,8 @@ class OwnLaw(Law[None]):
     ) -> tuple[None, FloatArray]:
         """Return the joint velocity of the controller, (n,) rad/s."""
         if self._nominal is not None:
-            self._correction = self._unit * estimate.jacobian - self._nominal(
-                observation.joint_position
-            )
+            nominal = self._nominal(observation.joint_position)
+            self._correction = self._unit * estimate.jacobian - nominal
         wanted = self._unit * reference[: self._rows]
         return state, self.own.step(self._in_plant_unit(observation), wanted).joint_velocity
 
@@ -338,14 +343,11 @@ class AidedController(Controller):
         self, make: Callable[..., Controller], config: MethodConfig, knowledge: RobotKnowledge
     ) -> None:
         """Make the controller, `make(config.law, knowledge)`, and compose the chain around it."""
-        self.law, natural = (
-            OwnLaw(partial(make, config.law), knowledge, config.aids),
-            in_natural_units(knowledge),
-        )
+        self.law = OwnLaw(partial(make, config.law), knowledge, config.aids)
+        natural = in_natural_units(knowledge)
         initial = initial_jacobian(config.initial, natural)
-        self._chain = ServoController(
-            Servo(ConstantEstimator(), self.law, initial, natural, config.aids)
-        )
+        servo = Servo(ConstantEstimator(), self.law, initial, natural, config.aids)
+        self._chain = ServoController(servo)
 
     def reset(self, observation: Observation, seed: int) -> None:
         """See `Controller.reset`."""

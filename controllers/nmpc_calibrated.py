@@ -28,9 +28,8 @@ from servobench.plant.contract.settings import (
 from servobench.plant.contract.signals import Command, Observation
 
 _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
-AGES: Final = (
-    4  # exposures in a control period that are considered where frames are late by unknown times
-)
+# Number of exposures in a control period that are considered where frames are late by unknown times.
+AGES: Final = 4
 
 
 @settings
@@ -99,20 +98,25 @@ class NmpcCalibrated(Controller):
         knowledge = in_natural_units(knowledge)
         period = knowledge.spec.period
         blocks = closed_form.Blocks.of(config.horizon_time, config.moves, period)
-        self._taps = (
-            zero_vibration_taps(*knowledge.true_tool, period) if config.image else np.ones(1)
-        )
-        delay = config.delay + period * float(np.arange(len(self._taps)) @ self._taps)
+        self._taps = np.ones(1)
+        if config.image:
+            self._taps = zero_vibration_taps(*knowledge.true_tool, period)
+        shaper_delay = period * float(np.arange(len(self._taps)) @ self._taps)
+        delay = config.delay + shaper_delay
         reach = blocks.count * blocks.length + delay
         check_preview(reach, knowledge.preview, period, "horizon_time + delay")
         if knowledge.true_symbolic is None:
             raise ValueError(
                 "true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics"
             )
-        self._config, self._spec, self._knowledge = config, knowledge.spec, knowledge
-        n, m = self._spec.n, self._spec.m
+        self._config = config
+        self._spec = knowledge.spec
+        self._knowledge = knowledge
+        n = self._spec.n
+        m = self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
-        self._blocks, self._places = blocks, blocks.places(delay)
+        self._blocks = blocks
+        self._places = blocks.places(delay)
         self._to_come = shaped_shares(closed_form.bridging_shares(config.delay, period), self._taps)
         self._along_plan = self._model.map(blocks.count)
         self._shares = closed_form.decay_shares(blocks.count, config.decay * blocks.length)
@@ -121,10 +125,9 @@ class NmpcCalibrated(Controller):
         self._exposures = self._reach - ages
         self._change: FloatArray = np.full(n, config.joint_acceleration_limit * blocks.length)
         limited = math.isfinite(config.joint_acceleration_limit)
+        terminal = config.terminal_weight / blocks.relative_length
         self._shape = QpShape(
-            weights=closed_form.move_weights(
-                blocks.count, 1.0, config.terminal_weight / blocks.relative_length
-            ),
+            weights=closed_form.move_weights(blocks.count, 1.0, terminal),
             move_weight=np.full(n, config.move_weight / blocks.relative_length**2),
             constant_gain=None,
             largest_move=self._spec.joint_velocity_limit * blocks.length,
@@ -134,18 +137,19 @@ class NmpcCalibrated(Controller):
             varying_jacobian=True,
         )
         self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
-        # of points, not of pixels
+        # A turn of the camera is known to act on points, not on pixels.
         self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0
         self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
         self._forget()
 
     def _forget(self) -> None:
-        n, m = self._spec.n, self._spec.m
+        """Start a run: nothing was sent, and the model counts as right until half of the offsets differ."""
+        n = self._spec.n
+        m = self._spec.m
         self._plan: FloatArray = np.zeros((self._blocks.count, n))
         self._sent: FloatArray = np.zeros((len(self._to_come), n))
         self._last: FloatArray = np.zeros(n)
         self._b: FloatArray = np.zeros(m)
-        # the model counts as right until half of the offsets differ
         self._offsets: FloatArray = np.zeros((self._frames, m))
         self._past: FloatArray | None = None
         self._jacobian: FloatArray | None = None
@@ -175,26 +179,26 @@ class NmpcCalibrated(Controller):
         if self._config.image:
             self._observe(observation, feature)
         start = present + self._to_come @ self._sent
-        places: FloatArray = self._spec.period * np.arange(float(len(reference)))
-        rows = sampled(
-            self._fixed(reference / self._knowledge.unit, observation.time + places), self._places
-        )
+        times: FloatArray = observation.time + self._spec.period * np.arange(float(len(reference)))
+        fixed = self._fixed(reference / self._knowledge.unit, times)
+        rows = sampled(fixed, self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
-        wanted = (
-            rows[0]
-            - error
-            + closed_form.decay_targets(error, rows[1:] - rows[0], self._shares)
-            - self._b
-        )
-        plan, limit = self._improve(start, wanted), self._spec.joint_velocity_limit
+        displacements = closed_form.decay_targets(error, rows[1:] - rows[0], self._shares)
+        wanted = rows[0] - error + displacements - self._b
+        plan = self._improve(start, wanted)
+        limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan[0] / self._blocks.length, -limit, limit)
-        passed = 1.0 / self._blocks.periods  # of the first block in this period
-        self._plan = (1.0 - passed) * plan + passed * np.concatenate([plan[1:], plan[-1:]])
+
+        # The share of the first block that passes in this period shifts the plan.
+        passed = 1.0 / self._blocks.periods
+        next_blocks = np.concatenate([plan[1:], plan[-1:]])
+        self._plan = (1.0 - passed) * plan + passed * next_blocks
         self._last = velocity * self._blocks.length
         sent = np.concatenate([self._sent, velocity[None] * self._spec.period])
         self._sent = sent[1:]
         if len(self._taps) > 1:
-            shaped = self._taps @ sent[: -1 - len(self._taps) : -1] / self._spec.period
+            newest_first = sent[: -1 - len(self._taps) : -1]
+            shaped = self._taps @ newest_first / self._spec.period
             velocity = np.clip(shaped, -limit, limit)
         return Command(velocity)
 
@@ -211,13 +215,15 @@ class NmpcCalibrated(Controller):
 
     def _observe(self, observation: Observation, feature: FloatArray) -> None:
         """Estimate b from a frame, given the feature (m,) of the model at the present joint positions."""
-        self._past = np.tile(feature, (self._reach + 1, 1)) if self._past is None else self._past
+        if self._past is None:
+            self._past = np.tile(feature, (self._reach + 1, 1))
         self._past = np.vstack([self._past[1:], feature])
         if not observation.feature_valid:
             return
         exposed = observation.time - self._spec.period * (self._reach - self._exposures)
         measured = np.tile(observation.feature / self._knowledge.unit, (len(exposed), 1))
         offsets = self._fixed(measured, exposed) - sampled(self._past, self._exposures)
+        # Of the possible exposures the one counts at which the frame agrees best with the present b.
         nearest = offsets[np.linalg.norm(offsets - self._b, axis=-1).argmin()]
         self._offsets = np.vstack([self._offsets[1:], nearest])
         self._b = np.median(self._offsets, axis=0)
@@ -229,7 +235,8 @@ class NmpcCalibrated(Controller):
         """
         if self._turn == 0.0:
             return features
-        c, s = np.cos(self._turn * times), np.sin(self._turn * times)
+        c = np.cos(self._turn * times)
+        s = np.sin(self._turn * times)
         x, y, z = features.T
         return np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
@@ -239,9 +246,11 @@ class NmpcCalibrated(Controller):
 
     def _improve(self, start: FloatArray, wanted: FloatArray) -> FloatArray:
         """Return a plan, (H, n) rad, from `start`, (n,) rad, to features `wanted`, (H, m); rest without a solution."""
-        last = self._last, self._change * self._spec.period
+        last = (self._last, self._change * self._spec.period)
         bounds = joint_bounds(self._shape, self._spec, last, start, np.zeros(0))
-        plan, change, iterations = self._plan, math.inf, 0
+        plan = self._plan
+        change = math.inf
+        iterations = 0
         while iterations < self._config.iterations and change > _PLAN_TOLERANCE:
             J, targets = self._linearise(start, plan, wanted)
             solution = self._program.solve(J, targets, bounds)
@@ -250,8 +259,10 @@ class NmpcCalibrated(Controller):
                 self._note(solution, 0, math.nan, math.nan)
                 return np.zeros_like(plan)
             change = float(np.abs(solution.moves - plan).max())
-            plan, iterations = solution.moves, iterations + 1
-        terminal_error = float(np.linalg.norm(targets[-1] - J[-1] @ plan.sum(axis=0)))
+            plan = solution.moves
+            iterations += 1
+        miss = targets[-1] - J[-1] @ plan.sum(axis=0)
+        terminal_error = float(np.linalg.norm(miss))
         self._note(solution, iterations, change, terminal_error)
         return plan
 
@@ -261,11 +272,9 @@ class NmpcCalibrated(Controller):
         """Return J (H, m, n) along the plan and the targets (H, m) that J Σ dq should meet."""
         travel = np.cumsum(plan, axis=0)
         features, jacobians = self._along_plan((start + travel).T)
-        J = (
-            np.asarray(jacobians)
-            .reshape(self._spec.m, self._blocks.count, self._spec.n)
-            .swapaxes(0, 1)
-        )
+        stacked = (self._spec.m, self._blocks.count, self._spec.n)
+        J = np.asarray(jacobians).reshape(stacked).swapaxes(0, 1)
+        # h(q) ≈ h(plan) + J (Σ dq − travel) along the plan.
         return J, wanted - np.asarray(features).T + np.einsum("tij,tj->ti", J, travel)
 
     def _note(
@@ -288,12 +297,11 @@ def exposure_ages(delays: Delays, period: float) -> FloatArray:
         delays: the true ones; a frame that is late by an unknown time also waits for the control instant.
         period: of control [s].
     """
-    youngest, spread = in_periods(delays.latency, period), in_periods(delays.latency_spread, period)
-    return (
-        np.array([youngest])
-        if spread == 0.0
-        else youngest + np.arange(0.0, spread + 1.0, 1.0 / AGES)
-    )
+    youngest = in_periods(delays.latency, period)
+    spread = in_periods(delays.latency_spread, period)
+    if spread == 0.0:
+        return np.array([youngest])
+    return youngest + np.arange(0.0, spread + 1.0, 1.0 / AGES)
 
 
 def zero_vibration_taps(frequency: float, damping: float, period: float) -> FloatArray:
@@ -314,7 +322,8 @@ def zero_vibration_taps(frequency: float, damping: float, period: float) -> Floa
     second = 1.0 - 1.0 / (1.0 + math.exp(-damping * frequency * half))
     place = in_periods(half, period)
     taps = np.zeros(2 + int(place))
-    taps[int(place) :] = second * np.array([1.0 - place % 1.0, place % 1.0])
+    share = place % 1.0
+    taps[int(place) :] = second * np.array([1.0 - share, share])
     taps[0] += 1.0 - second
     return taps
 
@@ -326,9 +335,11 @@ def shaped_shares(to_come: FloatArray, taps: FloatArray) -> FloatArray:
         to_come: the same of steps commanded, see `bridging_shares`.
         taps: of the shaper, the newest first.
     """
-    ages = np.arange(len(to_come) + len(taps) - 1, 0, -1)[:, None] - np.arange(len(taps))
+    oldest = len(to_come) + len(taps) - 1
+    ages = np.arange(oldest, 0, -1)[:, None] - np.arange(len(taps))
     commanded = np.concatenate([to_come[::-1], np.zeros(len(taps))])
-    return np.where(ages <= 0, 1.0, commanded[np.maximum(ages, 1) - 1]) @ taps
+    shares = np.where(ages <= 0, 1.0, commanded[np.maximum(ages, 1) - 1])
+    return shares @ taps
 
 
 def _linearisation(symbolic: Any, n: int, m: int) -> Any:  # noqa: ANN401 - an expression and a function of CasADi
@@ -349,9 +360,8 @@ def _linearisation(symbolic: Any, n: int, m: int) -> Any:  # noqa: ANN401 - an e
     function = create("linearisation", [q], [feature, casadi.jacobian(feature, q)])
     try:
         return function.expand()
-    except (
-        RuntimeError
-    ):  # foreign code, such as an FMU's, has no scalar operations; expanding only saves time
+    # Foreign code, such as an FMU's, has no scalar operations; expanding only saves time.
+    except RuntimeError:
         return function
 
 

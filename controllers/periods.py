@@ -4,15 +4,16 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 
-_WHOLE: float = (
-    1e-9  # [1] relative distance to a whole number below which a number of periods is whole
-)
+# [1] Relative distance to a whole number below which a number of periods is whole.
+_WHOLE: float = 1e-9
 
 
 def in_periods(time: float, period: float) -> float:
     """Return `time` [s] in control periods of `period` [s]: a fraction, or exactly a whole number up to rounding."""
     count = time / period
-    return float(round(count)) if abs(count - round(count)) < _WHOLE * max(1.0, count) else count
+    if abs(count - round(count)) < _WHOLE * max(1.0, count):
+        return float(round(count))
+    return count
 
 
 def whole_periods(time: float, period: float) -> int:
@@ -33,8 +34,9 @@ def check_preview(wanted: float, rows: int, period: float, settings: str) -> Non
         ValueError: it is too short.
     """
     if rows < in_periods(wanted, period):
-        came = f"got {rows} rows of {period:g} s; lengthen run.preview_time"
-        raise ValueError(f"preview must reach {settings} = {wanted:g} s, {came}")
+        raise ValueError(
+            f"preview must reach {settings} = {wanted:g} s, got {rows} rows of {period:g} s; lengthen run.preview_time"
+        )
 
 
 def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:

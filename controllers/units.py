@@ -32,11 +32,9 @@ def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
     if scale == 1.0:
         return knowledge
     natural = replace(feature, scale=1.0, lower=feature.lower / scale, upper=feature.upper / scale)
-    nominal, true, symbolic = (
-        knowledge.nominal_jacobian,
-        knowledge.true_jacobian,
-        knowledge.true_symbolic,
-    )
+    nominal = knowledge.nominal_jacobian
+    true = knowledge.true_jacobian
+    symbolic = knowledge.true_symbolic
     return replace(
         knowledge,
         spec=replace(knowledge.spec, feature=natural),

@@ -16,9 +16,8 @@ from servobench.plant.contract.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 2
-MAX_UNPACKED = (
-    256_000_000  # [bytes] sum of all arrays; trained networks have less than a hundredth of it
-)
+# [bytes] Largest sum of all arrays; trained networks have less than a hundredth of it.
+MAX_UNPACKED = 256_000_000
 READ_ERRORS = (  # exceptions of numpy's reader for a damaged file, or one that is no .npz
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, NotImplementedError, OSError, RuntimeError,
     SyntaxError, TypeError, ValueError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
@@ -38,7 +37,8 @@ class TrainedNetworks:
 
     def __post_init__(self) -> None:
         """Check that both networks are of the same robot."""
-        one, other = ((network.n, network.m) for network in (self.jacobian, self.controller))
+        one = (self.jacobian.n, self.jacobian.m)
+        other = (self.controller.n, self.controller.m)
         if one != other:
             raise ValueError(
                 f"both networks must have the same sizes (n, m), got {one} and {other}"
@@ -109,7 +109,8 @@ def _read_arrays(path: Path) -> dict[str, Any]:
 
 
 def _as_arrays(networks: TrainedNetworks) -> dict[str, Any]:
-    jacobian, controller = networks.jacobian, networks.controller
+    jacobian = networks.jacobian
+    controller = networks.controller
     return {
         "format": np.array(FORMAT),
         "format_version": np.array(FORMAT_VERSION),
@@ -128,10 +129,10 @@ def _from_arrays(arrays: dict[str, Any]) -> TrainedNetworks:
     error_history, position_history = (int(value) for value in arrays["history"])
     jacobian_error, controller_error = (float(value) for value in arrays["held_out_error"])
     jacobian = JacobianNetwork(*(arrays[f"jacobian_{name}"] for name in ARRAYS))
-    if tuple(arrays["sizes"].tolist()) != (jacobian.n, jacobian.m):
-        raise ValueError(
-            f"sizes must be {(jacobian.n, jacobian.m)}, got {arrays['sizes'].tolist()}"
-        )
+    sizes = arrays["sizes"].tolist()
+    wanted = (jacobian.n, jacobian.m)
+    if tuple(sizes) != wanted:
+        raise ValueError(f"sizes must be {wanted}, got {sizes}")
     centres, widths, weights = (arrays[f"controller_{name}"] for name in ARRAYS)
     kernel = cast(Kernel, str(arrays["kernel"]))
     step = float(arrays["step"])

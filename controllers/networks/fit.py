@@ -41,10 +41,10 @@ from servobench.plant.contract.signals import PlantSpec
 Progress = Callable[[float, str], None]
 JACOBIAN_SHARE = 0.4  # [1] share of the Jacobian network in the work, for the progress bar
 DIGEST_POINTS = 16  # number of joint positions at which nominal models are compared
-DIGEST_DECIMALS = (
-    9  # rounding, so that the last bits of another machine do not require a new training
-)
-MIN_SINGULAR_SHARE = 0.1  # [1] to the largest singular value of J; weaker directions are left out
+# Models are rounded, so that the last bits of another machine do not require a new training.
+DIGEST_DECIMALS = 9
+# Directions whose singular value is below this share of the largest one of J are left out.
+MIN_SINGULAR_SHARE = 0.1  # [1]
 CLUSTERING_POOL = 20  # number of samples per centre for k-means
 
 
@@ -120,28 +120,40 @@ def controller_samples(
         spec: sizes and speed limit.
         jacobian: of the nominal model, vectorised.
     """
-    plan, (lower, upper), (n, m) = config.controller, config.region(spec.n), (spec.n, spec.m)
+    plan = config.controller
+    lower, upper = config.region(spec.n)
+    n = spec.n
+    m = spec.m
+    count = len(unit)
     q = lower + (upper - lower) * unit[:, :n]
-    direction, magnitude = 2.0 * unit[:, n : n + m] - 1.0, unit[:, n + m : n + m + 1]
+    direction = 2.0 * unit[:, n : n + m] - 1.0
+    magnitude = unit[:, n + m : n + m + 1]
     error = plan.error_range * magnitude * direction
-    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (
-        spec.joint_velocity_limit * plan.step
-    )
-    back = np.concatenate([np.zeros((len(unit), 1, n)), np.cumsum(steps, axis=1)], axis=1)
+
+    # `back` is the way from each older joint position of the histories to q(k−1).
+    symmetric = 2.0 * unit[:, n + m + 1 :].reshape(count, -1, n) - 1.0
+    steps = symmetric * (spec.joint_velocity_limit * plan.step)
+    back = np.concatenate([np.zeros((count, 1, n)), np.cumsum(steps, axis=1)], axis=1)
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
     positions = q[:, None, :] - back[:, : plan.position_history]
+
     pinv = damped_inverse(J, plan.damping)
     if plan.damping == 0.0:
         pinv = np.asarray(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), dtype=np.float64)
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
-    # Ψ has no entry for a constant
+    # The matrix ψ of the fit of its entries has none for a constant, which the posture would need.
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0
-    gain, posture_step = plan.gain * plan.step * pinv, posture_gain * plan.step * free
-    command = q + (gain @ error[..., None])[..., 0] + posture_step
+    gain = plan.gain * plan.step * pinv
+    posture_step = posture_gain * plan.step * free
     return ControllerSamples(
-        rbf.information_vector(errors, positions), error, q, gain, posture_step, command
+        xi=rbf.information_vector(errors, positions),
+        error=error,
+        position=q,
+        gain=gain,
+        posture_step=posture_step,
+        command=q + (gain @ error[..., None])[..., 0] + posture_step,
     )
 
 
@@ -200,10 +212,10 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
         raise ValueError(
             "training needs a nominal model, and this plant has none; an FMU gets one by nominal in its mapping"
         )
-    n, m = networks.jacobian.n, networks.jacobian.m
-    if (n, m) != (spec.n, spec.m):
+    jacobian = networks.jacobian
+    if (jacobian.n, jacobian.m) != (spec.n, spec.m):
         raise ValueError(
-            f"network must be of {spec.n} joints and {spec.m} features, got {n} and {m}"
+            f"network must be of {spec.n} joints and {spec.m} features, got {jacobian.n} and {jacobian.m}"
         )
     return networks
 
@@ -217,15 +229,18 @@ def training_digest(
         ValueError: as `train`.
     """
     lower, upper = config.region(spec.n)
-    sample = lower + (upper - lower) * np.random.default_rng(0).random((DIGEST_POINTS, spec.n))
-    J = _checked(nominal_jacobian, sample, spec)
+    unit = np.random.default_rng(0).random((DIGEST_POINTS, spec.n))
+    J = _checked(nominal_jacobian, lower + (upper - lower) * unit, spec)
+    # Adding 0 makes −0 into 0.
+    rounded = np.round(J, DIGEST_DECIMALS) + 0.0
     content = {
         "config": asdict(config),
         "sizes": [spec.n, spec.m],
         "joint_velocity_limit": spec.joint_velocity_limit.tolist(),
-        "model": (np.round(J, DIGEST_DECIMALS) + 0.0).ravel().tolist(),
+        "model": rounded.ravel().tolist(),
     }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _train_jacobian(
@@ -243,23 +258,27 @@ def _train_jacobian(
     J = _checked(nominal_jacobian, q, spec)
     held = max(1, round(plan.samples * config.held_out))
     spread = float(np.linalg.norm(upper - lower)) / 2.0
+    fitted = J[held:].reshape(len(q) - held, -1)
+    # Each joint column takes the width and the regularisation of its own least held-out error.
     squares: FloatArray = np.full(spec.n, np.inf)
-    widths, weights = np.ones((spec.n, plan.centres)), np.zeros((spec.n, spec.m, plan.centres))
+    widths = np.ones((spec.n, plan.centres))
+    weights = np.zeros((spec.n, spec.m, plan.centres))
     for index, scale in enumerate(plan.width_scales):
         report(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
-        theta = rbf.hidden_features(q, centres, np.full(plan.centres, scale * spread), "gaussian")
-        for W in ridge_path(
-            theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations
-        ):
+        width = scale * spread
+        theta = rbf.hidden_features(q, centres, np.full(plan.centres, width), "gaussian")
+        for W in ridge_path(theta[held:], fitted, plan.regularisations):
             residual = (theta[:held] @ W).reshape(held, spec.m, spec.n) - J[:held]
             square = np.einsum("smn,smn->n", residual, residual)
+            columns = W.reshape(plan.centres, spec.m, spec.n)
             for i in np.flatnonzero(square < squares):
-                squares[i], widths[i] = square[i], scale * spread
-                weights[i] = W.reshape(plan.centres, spec.m, spec.n)[:, :, i].T
-    network = rbf.JacobianNetwork(
-        np.broadcast_to(centres, (spec.n, *centres.shape)), widths, weights
-    )
-    return network, float(np.sqrt(squares.sum() / np.einsum("smn,smn->", J[:held], J[:held])))
+                squares[i] = square[i]
+                widths[i] = width
+                weights[i] = columns[:, :, i].T
+    shared = np.broadcast_to(centres, (spec.n, *centres.shape))
+    network = rbf.JacobianNetwork(shared, widths, weights)
+    total = np.einsum("smn,smn->", J[:held], J[:held])
+    return network, float(np.sqrt(squares.sum() / total))
 
 
 def _train_controller(
@@ -276,15 +295,16 @@ def _train_controller(
     centres = choose_centres(pool_xi, plan.hidden, rng, plan.placement)
     wanted = samples.command
     held = max(1, round(plan.samples * config.held_out))
-    spread = float(np.sqrt(np.mean(np.sum((pool_xi - pool_xi.mean(axis=0)) ** 2, axis=-1))))
-    best, network = np.inf, None
+    offsets = pool_xi - pool_xi.mean(axis=0)
+    spread = float(np.sqrt(np.mean(np.sum(offsets**2, axis=-1))))
+    best = np.inf
+    network = None
     for index, scale in enumerate(plan.width_scales):
-        report(
-            JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales),
-            "controller network",
-        )
+        done = (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales)
+        report(JACOBIAN_SHARE + done, "controller network")
         reach = scale * spread  # the distance at which a unit has fallen to 1/e
-        widths = np.full(plan.hidden, reach if plan.kernel == "gaussian" else np.sqrt(reach))
+        width = reach if plan.kernel == "gaussian" else np.sqrt(reach)
+        widths = np.full(plan.hidden, width)
         h = rbf.hidden_features(samples.xi, centres, widths, plan.kernel)
         for weights in _controller_weights(plan, samples, wanted, h, held):
             candidate = rbf.ControllerNetwork(
@@ -296,11 +316,11 @@ def _train_controller(
                 plan.kernel,
                 plan.step,
             )
-            error = float(
-                np.sqrt(np.mean((candidate.command(samples.xi[:held]) - wanted[:held]) ** 2))
-            )
+            misses = candidate.command(samples.xi[:held]) - wanted[:held]
+            error = float(np.sqrt(np.mean(misses**2)))
             if error < best:
-                best, network = error, candidate
+                best = error
+                network = candidate
     if network is None:
         raise ValueError(
             "the controller network could not be fitted: every held-out error is not finite"
@@ -353,15 +373,16 @@ def ridge_path(
     projected = V.T @ (features.T @ targets)
     largest = eigenvalues[-1]
     for relative in regularisations:
-        yield V @ (projected / (np.maximum(eigenvalues, 0.0) + relative * largest)[:, None])
+        denominators = np.maximum(eigenvalues, 0.0) + relative * largest
+        yield V @ (projected / denominators[:, None])
 
 
 def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec) -> FloatArray:
+    """Return the nominal Jacobians, (S, m, n), at q, (S, n), rad, after a check of shape and values."""
     J = np.asarray(nominal_jacobian(q), dtype=np.float64)
-    if J.shape != (len(q), spec.m, spec.n):
-        raise ValueError(
-            f"nominal_jacobian must return {(len(q), spec.m, spec.n)} for {q.shape}, got {J.shape}"
-        )
+    wanted = (len(q), spec.m, spec.n)
+    if J.shape != wanted:
+        raise ValueError(f"nominal_jacobian must return {wanted} for {q.shape}, got {J.shape}")
     if not np.isfinite(J).all():
         raise ValueError("nominal_jacobian must be finite in the whole training region")
     return J

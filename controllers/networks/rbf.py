@@ -44,7 +44,8 @@ def hidden_features(
     """
     offset = xi[..., None, :] - centres
     square = np.einsum("...p,...p->...", offset, offset)
-    exponent = (square if kernel == "gaussian" else np.sqrt(square)) / widths**2
+    distance = square if kernel == "gaussian" else np.sqrt(square)
+    exponent = distance / widths**2
     return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
 
 
@@ -55,7 +56,9 @@ def _layer(
     offset = x[..., :, None] - centres
     offset *= offset
     square: FloatArray = np.vecmat(ones, offset)
-    exponent = (square if kernel == "gaussian" else np.sqrt(square, out=square)) * decay
+    if kernel != "gaussian":
+        np.sqrt(square, out=square)
+    exponent = square * decay
     np.maximum(exponent, MIN_EXPONENT, out=exponent)
     return np.exp(exponent, out=exponent)
 
@@ -102,11 +105,8 @@ class JacobianNetwork:
 
     def __post_init__(self) -> None:
         """Check that the three arrays fit together and freeze them."""
-        if (
-            self.centres.ndim != 3
-            or self.weights.ndim != 3
-            or 0 in self.centres.shape + self.weights.shape
-        ):
+        solid = self.centres.ndim == 3 and self.weights.ndim == 3
+        if not solid or 0 in self.centres.shape + self.weights.shape:
             raise ValueError(
                 "centres and weights must be (n, L, n) and (n, m, L) with all sizes at least 1, "
                 f"got {self.centres.shape} and {self.weights.shape}"
@@ -133,10 +133,11 @@ class JacobianNetwork:
     def layer_of(self) -> npt.NDArray[np.int_]:
         """Index of the hidden layer of each column, (n,): columns of equal centres and widths share one."""
         layers: dict[bytes, int] = {}
-        columns = zip(self.centres, self.widths, strict=True)
-        return np.array(
-            [layers.setdefault(c.tobytes() + width.tobytes(), len(layers)) for c, width in columns]
-        )
+        indices = []
+        for centres, widths in zip(self.centres, self.widths, strict=True):
+            layer = centres.tobytes() + widths.tobytes()
+            indices.append(layers.setdefault(layer, len(layers)))
+        return np.array(indices)
 
     @cached_property
     def rows(self) -> FloatArray:
@@ -156,12 +157,11 @@ class JacobianNetwork:
             rows: W by rows of the Jacobian, (..., m, n, L), m/rad.
             theta: from `features`, (..., T, U, L).
         """
-        lead, (count, layers, units) = theta.shape[:-3], theta.shape[-3:]
-        # the products of each layer with each column, of which most are not wanted
-        every = (
-            theta.reshape(*lead, count * layers, units)
-            @ rows.reshape(*rows.shape[:-3], -1, units).mT
-        )
+        *lead, count, layers, units = theta.shape
+        # One product of all layers with all columns is faster than one for each column, although most are not wanted.
+        flat = theta.reshape(*lead, count * layers, units)
+        columns = rows.reshape(*rows.shape[:-3], -1, units)
+        every = flat @ columns.mT
         return every.reshape(*lead, count, -1).take(self._places, axis=-1)
 
     def gradient(
@@ -175,29 +175,27 @@ class JacobianNetwork:
             theta: θ(q_t) from `features`, (..., T, U, L).
         """
         *lead, count, layers, units = theta.shape
-        of_layers = joint_steps[..., None, :] * self._members
-        factors = errors[..., None, :, None] * of_layers[..., None, :]
+        # Δq_{i,t} in the layer of joint column i, and 0 in all others.
+        steps = joint_steps[..., None, :] * self._members
+        factors = errors[..., None, :, None] * steps[..., None, :]
         flat = theta.reshape(*lead, count * layers, units)
         gradient = factors.reshape(*lead, count * layers, -1).mT @ flat
         return np.asarray(gradient.reshape(*lead, self.m, self.n, units))
 
     def jacobian(self, q: FloatArray, rows: FloatArray | None = None) -> FloatArray:
         """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad, with the trained weights or with others."""
-        return self.output(self.rows if rows is None else rows, self.features(q)[..., None, :, :])[
-            ..., 0, :, :
-        ]
+        theta = self.features(q)[..., None, :, :]
+        return self.output(self.rows if rows is None else rows, theta)[..., 0, :, :]
 
     @cached_property
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Centres of the layers, (U, n, L), or (1, n, L) where all share them; ones, (n,); and −1/δ², (U, L)."""
         _, first = np.unique(self.layer_of, return_index=True)
         centres = self.centres[first].swapaxes(-1, -2)
-        shared = bool((centres == centres[0]).all())
-        return (
-            np.ascontiguousarray(centres[: 1 if shared else None]),
-            np.ones(self.n),
-            -1.0 / self.widths[first] ** 2,
-        )
+        if (centres == centres[0]).all():
+            centres = centres[:1]
+        decay = -1.0 / self.widths[first] ** 2
+        return np.ascontiguousarray(centres), np.ones(self.n), decay
 
     @cached_property
     def _members(self) -> FloatArray:
@@ -207,7 +205,8 @@ class JacobianNetwork:
     @cached_property
     def _places(self) -> npt.NDArray[np.int_]:
         """Where the entries of Ĵ are among the products of all U layers with all columns, (m, n)."""
-        return self.layer_of * self.m * self.n + np.arange(self.m * self.n).reshape(self.m, self.n)
+        entries = np.arange(self.m * self.n).reshape(self.m, self.n)
+        return self.layer_of * self.m * self.n + entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +218,8 @@ class ControllerNetwork:
     weights: FloatArray  # W, (n, p, N_h); `weights[:, j]` maps the hidden layer to the column ψ_j
     error_history: int  # L_e, how many errors ξ holds
     position_history: int  # L_c, how many joint positions ξ holds
-    kernel: Kernel = "exponential"  # of the hidden layer, see `hidden_features`
-    step: float = STEP  # between the instants of ξ, and from q to the position ψ ξ [s]
+    kernel: Kernel = "exponential"  # kernel of the hidden layer, see `hidden_features`
+    step: float = STEP  # [s] between the instants of ξ, and from q to the position ψ ξ
     offset_free: bool = False  # whether `origin` is the trained network's own command at rest
 
     def __post_init__(self) -> None:
@@ -235,13 +234,9 @@ class ControllerNetwork:
             )
         n, p, hidden = self.weights.shape
         _freeze(self, centres=(hidden, p), widths=(hidden,), weights=(n, p, hidden))
+        lengths = (self.error_history, self.position_history)
         left = p - n * self.position_history
-        if (
-            self.error_history < 1
-            or self.position_history < 1
-            or left < 1
-            or left % self.error_history
-        ):
+        if min(lengths) < 1 or left < 1 or left % self.error_history:
             raise ValueError(
                 f"weights must have m L_e + n L_c columns with L_e = {self.error_history}, n = {n} and "
                 f"L_c = {self.position_history}, got {p}"
@@ -270,16 +265,14 @@ class ControllerNetwork:
         newest = self.m * self.error_history
         if not self.offset_free:
             return xi[..., newest : newest + self.n]
-        return self.command(xi * (np.arange(xi.shape[-1]) >= newest))
+        is_position = np.arange(xi.shape[-1]) >= newest
+        return self.command(xi * is_position)
 
     @cached_property
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Centres, (p, N_h), ones, (p,), and −1/γ², (N_h,)."""
-        return (
-            np.ascontiguousarray(self.centres.T),
-            np.ones(self.centres.shape[1]),
-            -1.0 / self.widths**2,
-        )
+        centres = np.ascontiguousarray(self.centres.T)
+        return centres, np.ones(len(centres)), -1.0 / self.widths**2
 
 
 def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, ...]) -> None:
