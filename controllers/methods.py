@@ -302,10 +302,13 @@ class OwnLaw(Law[None]):
         self._unit = given.spec.feature.scale
         self.seed = 0
         self._correction: FloatArray | float = 0.0
-        self._rows = 1 if aids.feedforward else 1 + given.preview
         model = given.nominal_jacobian if self._nominal is None else self._jacobian
+        self._rows = 1
+        self.owns = frozenset()
+        if not aids.feedforward:
+            self._rows = 1 + given.preview
+            self.owns = frozenset({"preview"})
         self.own = make(replace(given, nominal_jacobian=model, preview=self._rows - 1))
-        self.owns = frozenset() if aids.feedforward else frozenset({"preview"})
         self.in_model_frame = self.own.in_model_frame
 
     def start(self, observation: Observation) -> None:

@@ -184,7 +184,9 @@ class Servo:
                 f"joint_velocity is not finite at {observation.time:.5g} s: {wanted.tolist()}, by the Jacobian "
                 f"{J.tolist()}"
             )
-        forward = later[..., 1, :] - later[..., 0, :] if self._feeds_forward else np.zeros(())
+        forward: FloatArray = np.zeros(())
+        if self._feeds_forward:
+            forward = later[..., 1, :] - later[..., 0, :]
         u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
         u = self.law.restrained(law, wanted, u)
         law = self.law.noted(law, u, limited)

@@ -84,7 +84,9 @@ def choose_centres(
 
 def pool_size(count: int, placement: Placement) -> int:
     """Return how many points `choose_centres` needs to place `count` centres."""
-    return count * CLUSTERING_POOL if placement == "kmeans" else count
+    if placement == "kmeans":
+        return count * CLUSTERING_POOL
+    return count
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,7 +90,10 @@ class Estimation:
         lead = observation.feature.shape[:-1]
         q = observation.joint_position
         base = self._given(q, jacobian)
-        estimator = self.estimator.start(jacobian if self._model == "own" else jacobian - base)
+        deviation = jacobian
+        if self._model != "own":
+            deviation = jacobian - base
+        estimator = self.estimator.start(deviation)
         if self._uses_own:
             base = self.estimator.jacobian(estimator, q)
         pair = None if self.pairing is None else self.pairing.start(observation, base)

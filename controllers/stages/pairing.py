@@ -166,9 +166,9 @@ class Anchor(NamedTuple):
 class PairState(NamedTuple):
     """The state of the stage."""
 
-    past: FloatArray  # [q, Σ x] of the last periods, (..., H, n + m), the newest first
+    past: FloatArray  # [q, Σ x] in the last periods, (..., H, n + m), the newest first
     base: FloatArray  # J_n, (..., m, n), of the last period
-    bank: FloatArray  # of a filter for each delay, (..., D, 2m+n+1, m+n+1)
+    bank: FloatArray  # a filter for each delay, (..., D, 2m+n+1, m+n+1)
     scores: FloatArray  # ℓ_d, (..., D)
     noise: NoiseLevel  # σ²
     candidate: IntArray  # index of the delay, (...)
@@ -235,9 +235,10 @@ class Pairing:
         self._period = spec.period
         if aids.delay == "identified":
             self._candidates = Candidates.up_to(aids.longest_delay, spec.period)
+        elif aids.delay == "given":
+            self._candidates = Candidates(np.array([in_periods(latency, spec.period)]))
         else:
-            given = in_periods(latency, spec.period) if aids.delay == "given" else 0.0
-            self._candidates = Candidates(np.array([given]))
+            self._candidates = Candidates(np.zeros(1))
         self.delays = self._candidates.delays
         motion = max(1, whole_periods(MOTION_TIME, spec.period))
         doubtful = MAX_DOUBTFUL_GAP * motion
@@ -307,7 +308,9 @@ class Pairing:
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""
-        return state.noise.deviation if self._aids.noise == "identified" else None
+        if self._aids.noise == "given":
+            return None
+        return state.noise.deviation
 
     def learn(
         self, state: PairState, feature_step: FloatArray, duration: FloatArray, valid: BoolArray

@@ -114,7 +114,9 @@ class JointResponse(NamedTuple):
             joint_position: (..., n), of which only the shape counts.
         """
         *lead, n = joint_position.shape
-        left = np.broadcast_to(remaining_share(delay, lag, period, length), (*lead, length))
+        share = remaining_share(delay, lag, period, length)
+        left = np.broadcast_to(share, (*lead, length))
+        arrival = np.add.reduce(left, axis=-1)
         nothing = np.zeros((*lead, 0))
         return cls(
             A=nothing[..., None],
@@ -122,7 +124,7 @@ class JointResponse(NamedTuple):
             commands=np.zeros((*lead, length, n)),
             response=nothing,
             left=left,
-            lead=np.full(tuple(lead), np.add.reduce(left, axis=-1))[()],
+            lead=np.full(tuple(lead), arrival)[()],
             window=1,
             period=period,
         )

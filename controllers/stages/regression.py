@@ -46,7 +46,7 @@ from servobench.plant.contract.lanes import Tree, branch, map_arrays, outer, pic
 from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
-GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
+GATE: Final = 10.0  # [1] g, the largest ‖ν‖²/s; the excess is taken for noise of the frame
 # [1] Largest lead of one filter in −2 ln likelihood, so that another can come back after a change.
 LEAD_CAP: Final = 100.0
 # The filters of this number of runs side by side are updated at once, and all of these if a single one learns.

@@ -69,8 +69,9 @@ def _weighted_power_integral(power: int, rate: float, horizon: float) -> float:
             term *= -s / (k + 1)
         return float(horizon ** (power + 1) * total)
     decay = math.exp(-s)
-    first = (1.0 - decay * (1.0 + s)) / s**2
-    value = first if power == 1 else (2.0 * first - decay) / s
+    value = (1.0 - decay * (1.0 + s)) / s**2
+    if power == 2:
+        value = (2.0 * value - decay) / s
     return float(horizon ** (power + 1) * value)
 
 

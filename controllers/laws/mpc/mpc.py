@@ -279,13 +279,14 @@ class MpcLaw(Law[MpcState]):
         plan = state.plan
         travel = plan.moves.sum(axis=-2) * (self._blocks.count / self._shape.moves)
         objective = where(plan.success > 0.0, self._objective(state), np.asarray(math.nan))
+        predicted = np.matvec(state.J, travel)
         return {
             "solver_success": plan.success,
             "solver_iterations": plan.iterations,
             "objective": objective,
             "fallbacks": state.fallbacks,
             "active_limits": plan.active_limits,
-            "predicted_terminal_error": norm(state.final - np.matvec(state.J, travel)),
+            "predicted_terminal_error": norm(state.final - predicted),
         }
 
     def _objective(self, state: MpcState) -> FloatArray:
