@@ -14,7 +14,8 @@ from servobench.harness.config.entries import CONTROLLER
 from servobench.harness.config.settings import Settings, flatten
 from servobench.plant.contract.faults import ConfigurationError
 
-GAIN, DAMPING = 6.0, 0.02
+GAIN = 6.0
+DAMPING = 0.02
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class Inverse(servobench.Controller):
     aids = servobench.EQUIPPED
 
     def __init__(self, config: InverseConfig, knowledge):
-        self.knowledge, self.resets = knowledge, []
+        self.knowledge = knowledge
+        self.resets = []
         self.rate = (1.0 - np.exp(-config.gain * knowledge.spec.period)) / knowledge.spec.period
         self.damping = DAMPING * knowledge.spec.feature.scale
 
@@ -45,7 +47,8 @@ class Inverse(servobench.Controller):
 
 def build(aids=EQUIPPED):
     """Return the user's controller, and a driver of it with aids on the rig."""
-    entry, rig = CONTROLLER.make_entry(type("Own", (Inverse,), {"aids": aids}), "own.py"), Rig(6, 3)
+    entry = CONTROLLER.make_entry(type("Own", (Inverse,), {"aids": aids}), "own.py")
+    rig = Rig(6, 3)
     controller = entry.build(entry.config(), rig.knowledge())
     return controller.law.own, Driver(controller, rig).begin()
 
@@ -78,10 +81,13 @@ def test_the_jacobian_is_the_nominal_one_before_a_run_and_a_better_one_in_its_st
     own, driver = build()
     rig = driver.rig
     for _ in range(2):
-        given, model = own.knowledge.nominal_jacobian(rig.start), rig.model_jacobian(rig.start)
+        given = own.knowledge.nominal_jacobian(rig.start)
+        model = rig.model_jacobian(rig.start)
         np.testing.assert_array_equal(given, model)
         driver.run(40)
-        found, model, true = own.J, rig.model_jacobian(rig.q), rig.jacobian(rig.q)
+        found = own.J
+        model = rig.model_jacobian(rig.q)
+        true = rig.jacobian(rig.q)
         # The direction in which something could be learned
         moved = driver.rig.goal - driver.rig.start
         assert np.linalg.norm((found - true) @ moved) < 0.5 * np.linalg.norm((model - true) @ moved)

@@ -82,7 +82,8 @@ class Modelled(Recorder):
 
 def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_began():
     """E₀ is that of Ĵ₀ = 0, so that E = q₀ J at first: Ĵ = B + E − E₀, and E learns from Δy − B Δq + E₀ Δq."""
-    q, dq = np.array([0.3, 0.1]), np.array([0.1, 0.2])
+    q = np.array([0.3, 0.1])
+    dq = np.array([0.1, 0.2])
 
     class Started(Modelled):
         def start(self, jacobian):
@@ -94,7 +95,8 @@ def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_bega
     state = stages.update(state, Observation(0.0, q, [0.0]), np.zeros(1))
     np.testing.assert_allclose(state.jacobian, curved(q))
     state = stages.update(state, Observation(PERIOD, q + dq, [0.4]), np.zeros(1))
-    x, E0 = 1.35 * 0.1 + 0.5 * 0.2, 0.3 * (2.0 * 0.1 + 1.0 * 0.2)
+    x = 1.35 * 0.1 + 0.5 * 0.2
+    E0 = 0.3 * (2.0 * 0.1 + 1.0 * 0.2)
     np.testing.assert_allclose(estimator.motions[0].feature_step, [0.4 - x + E0])
     own = Estimation(Started(), two_joints(), AidsConfig(noise="identified"), NONE)
     begun = own.start(Observation(0.0, q, [0.0]), np.zeros((1, 2)))
@@ -102,7 +104,8 @@ def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_bega
 
 
 def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_frames():
-    q, recorder = path(0.6), Recorder()
+    q = path(0.6)
+    recorder = Recorder()
     y = late_features(q, np.eye(M)) + 0.01 * np.random.default_rng(3).normal(size=(len(q), M))
     states, _ = follow(recorder, q, y, filter=True, feature_noise=0.01)
     e = np.array([state.learned.pair.regression.mean[:, -1] for state in states])
@@ -115,8 +118,10 @@ def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_f
 @pytest.mark.parametrize("model", ["own", "regression"])
 def test_what_an_estimator_learned_from_false_frames_is_taken_back_with_them(model):
     """Once the next true frame is seen, it has learned from the motion over both as if they had been lost."""
-    q, found = path(2), []
-    y, valid = late_features(q, np.eye(M)), np.full(len(q), True)
+    q = path(2)
+    found = []
+    y = late_features(q, np.eye(M))
+    valid = np.full(len(q), True)
     valid[[20, 29, 30]] = False
     for false in (0.0, 0.3):
         shown = y + np.where(valid, 0.0, false)[:, None]
@@ -138,7 +143,8 @@ def test_what_an_estimator_learned_from_false_frames_is_taken_back_with_them(mod
 def follow(estimator, q, y, knowledge=MODELLED, **aids):
     """Return the states after each period, and the stages."""
     stages = Estimation(estimator, knowledge, AidsConfig(**aids), NONE)
-    state, states = stages.start(Observation(0.0, q[0], y[0]), knowledge.nominal_jacobian(q[0])), []
+    state = stages.start(Observation(0.0, q[0], y[0]), knowledge.nominal_jacobian(q[0]))
+    states = []
     for k in range(len(q)):
         state = stages.update(
             state, Observation(k * knowledge.spec.period, q[k], y[k]), np.zeros(M)
@@ -176,7 +182,8 @@ def test_as_much_is_learned_in_a_second_at_every_rate(period, count, aids):
         MODELLED, spec=dataclasses.replace(KNOWLEDGE.spec, period=period)
     )
     t = period * np.arange(round(2.0 / period))
-    q, recorder = np.outer(t, np.arange(1.0, N + 1.0)), Recorder()
+    q = np.outer(t, np.arange(1.0, N + 1.0))
+    recorder = Recorder()
     follow(recorder, q, 0.1 * q[:, :M], knowledge, **aids)
     assert len(recorder.motions) == (len(t) - 1) // count
     for motion in recorder.motions:
@@ -187,7 +194,8 @@ def test_as_much_is_learned_in_a_second_at_every_rate(period, count, aids):
 
 
 def test_a_motion_is_paired_with_that_of_the_joints_when_its_frames_were_exposed():
-    q, recorder = path(1.5), Recorder()
+    q = path(1.5)
+    recorder = Recorder()
     stages = Estimation(
         recorder, MODELLED, AidsConfig(delay="given", noise="identified"), Delays(0.15, 0.0, 0.0)
     )
@@ -213,7 +221,8 @@ def test_without_a_nominal_model_the_first_jacobian_stands_for_it():
     stages = Estimation(
         ProjectionEstimator(BroydenConfig()), unknown, AidsConfig(model="regression"), NONE
     )
-    state, y = stages.start(Observation(0.0, q[0], np.zeros(M)), J), np.matvec(TURN @ J, q)
+    state = stages.start(Observation(0.0, q[0], np.zeros(M)), J)
+    y = np.matvec(TURN @ J, q)
     for k in range(40):
         state = stages.update(state, Observation(k * PERIOD, q[k], y[k]), np.zeros(M))
     np.testing.assert_allclose(state.jacobian, TURN @ J, atol=0.08)

@@ -26,7 +26,9 @@ def test_feedforward_and_posture_by_hand():
     """dq = dq_law + J⁺ r + κ (I − J⁺J)(q_c − q), with the middle of the working region as q_c."""
     region = np.full(N, -0.5), np.full(N, 1.5)
     knowledge = dataclasses.replace(KNOWLEDGE, region=region)
-    q, r, wanted = np.full(N, 0.1), np.array([0.001, 0.0, 0.002]), np.linspace(-0.1, 0.1, N)
+    q = np.full(N, 0.1)
+    r = np.array([0.001, 0.0, 0.002])
+    wanted = np.linspace(-0.1, 0.1, N)
     pinv = np.linalg.pinv(A)
     posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (0.5 - q)
     aids = {"feedforward": True, "posture": True, "posture_gain": 0.2, "damping": 1e-9}
@@ -37,7 +39,8 @@ def test_feedforward_and_posture_by_hand():
 
 def test_the_posture_does_not_move_the_feature_and_comes_nearer_to_the_middle():
     q = np.linspace(-1.0, 1.0, N)
-    y, null = A @ q, np.eye(N) - np.linalg.pinv(A) @ A
+    y = A @ q
+    null = np.eye(N) - np.linalg.pinv(A) @ A
     for _ in range(200):
         u, _ = finish(np.zeros(N), q, posture=True, posture_gain=0.2, damping=1e-9)
         q = q + u * PERIOD
@@ -51,10 +54,10 @@ def test_the_posture_does_not_move_the_feature_and_comes_nearer_to_the_middle():
 def test_the_posture_does_not_depend_on_the_control_rate(period):
     ends = []
     for dt in (PERIOD, period):
-        knowledge, q = (
-            dataclasses.replace(KNOWLEDGE, spec=dataclasses.replace(KNOWLEDGE.spec, period=dt)),
-            np.ones(N),
+        knowledge = dataclasses.replace(
+            KNOWLEDGE, spec=dataclasses.replace(KNOWLEDGE.spec, period=dt)
         )
+        q = np.ones(N)
         for _ in range(round(2.0 / dt)):
             q = q + finish(np.zeros(N), q, posture=True, knowledge=knowledge, damping=1e-9)[0] * dt
         ends.append(q)
@@ -83,7 +86,8 @@ def test_a_command_beyond_the_limits_is_scaled_cut_or_taken_over_by_joints_with_
 
 
 def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
-    J, wanted = np.array([[1.0, 1.0, 0.0, 0.0, 0.0]] * 1), np.array([1.5, 0.0, 0.0, 0.0, 0.0])
+    J = np.array([[1.0, 1.0, 0.0, 0.0, 0.0]] * 1)
+    wanted = np.array([1.5, 0.0, 0.0, 0.0, 0.0])
     at_edge = np.array([0.0, 6.0, 0.0, 0.0, 0.0])  # the reach of the toy's joints
     free, _ = finish(wanted, J=J, limit="redistribute", damping=1e-6)
     held, _ = finish(wanted, at_edge, J=J, limit="redistribute", damping=1e-6)
@@ -105,9 +109,11 @@ def test_only_a_remainder_and_a_room_above_rounding_are_taken_over(excess, room,
 @given(n=st.integers(1, 7), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, seed):
     rng = np.random.default_rng(seed)
-    J, limit = rng.normal(size=(m, n)), rng.uniform(0.05, 0.2, n)
+    J = rng.normal(size=(m, n))
+    limit = rng.uniform(0.05, 0.2, n)
     wanted = rng.normal(size=n)
-    dq, scaled = redistribute(wanted, J, limit, 1e-6, (limit, limit)), scale_to_limit(wanted, limit)
+    dq = redistribute(wanted, J, limit, 1e-6, (limit, limit))
+    scaled = scale_to_limit(wanted, limit)
     assert (np.abs(dq) <= limit * (1 + 1e-12)).all()
     way = J @ wanted
     if np.linalg.cond(J) < 100.0:

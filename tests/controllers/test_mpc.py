@@ -131,7 +131,8 @@ def test_both_solvers_find_the_same_plan_multipliers_and_criterion(constant, see
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
 def test_the_objective_is_the_criterion_of_the_moves(solver):
     qp, shape = program(solver=solver, move=0.3, change=0.12)
-    J, targets = random_jacobian(0, 2, 4), np.random.default_rng(0).normal(size=(shape.moves, 2))
+    J = random_jacobian(0, 2, 4)
+    targets = np.random.default_rng(0).normal(size=(shape.moves, 2))
     found = qp.solve(J, targets, make_bounds(shape, travel=0.7))
     missed = targets - np.cumsum(found.moves, axis=0) @ J.T
     criterion = 0.5 * (
@@ -184,10 +185,8 @@ def test_a_plan_is_checked_against_every_limit_for_each_run():
 def test_position_rows_out_of_reach_change_nothing(constant, travel):
     # Five moves of at most 0.3 rad reach 1.5 rad: a limit at 1.6 rad is left out, nearer ones are not.
     qp, shape = program(constant=constant, move=0.3)
-    J, targets = (
-        random_jacobian(1, 2, 4),
-        np.full((shape.moves, 2), 3.0 * (40.0 if constant else 1.0)),
-    )
+    J = random_jacobian(1, 2, 4)
+    targets = np.full((shape.moves, 2), 3.0 * (40.0 if constant else 1.0))
     found = qp.solve(J, targets, make_bounds(shape, travel=travel))
     far = qp.solve(J, targets, make_bounds(shape, travel=1e3))
     rows = found.multiplier.size - far.multiplier.size
@@ -211,7 +210,9 @@ def test_solvers_print_nothing_and_keep_nothing_of_the_solve_before(capfd):
 
 
 def test_shapes_are_equal_if_all_their_entries_are():
-    (_, one), (_, same), (_, other) = program(), program(), program(seed=1)
+    _, one = program()
+    _, same = program()
+    _, other = program(seed=1)
     assert len({one, same, other, replace(one, view_rows=np.zeros((0, 3)))}) == 3
     assert one != "a shape"
 
@@ -366,11 +367,9 @@ def test_settings_that_do_not_fit_the_plant_are_named():
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 @pytest.mark.parametrize("period", [0.02, 0.008, 0.004])
 def test_the_control_rate_changes_neither_the_plan_nor_the_command(mode, period):
-    J, y, sent = (
-        random_jacobian(4),
-        np.array([0.1, -0.2, 0.05]),
-        np.array([0.1, 0.0, -0.2, 0.3, 0.0, 0.1]),
-    )
+    J = random_jacobian(4)
+    y = np.array([0.1, -0.2, 0.05])
+    sent = np.array([0.1, 0.0, -0.2, 0.3, 0.0, 0.1])
     commands = []
     for rate in (PERIOD, period):
         spec = replace(make_spec(speed=0.5), period=rate)
@@ -400,7 +399,8 @@ def test_a_slow_rate_has_fewer_and_longer_blocks_of_the_same_weights():
 @pytest.mark.parametrize("moves", [5, 20])
 def test_the_optimum_in_continuous_time_does_not_depend_on_the_length_of_the_blocks(mode, moves):
     # In constant mode the integrals are exact, in the other one the sums tend to them.
-    J, spec = random_jacobian(5), replace(make_spec(speed=1e3, reach=1e3), period=0.025)
+    J = random_jacobian(5)
+    spec = replace(make_spec(speed=1e3, reach=1e3), period=0.025)
     found = [
         make_law(
             spec, mode=mode, moves=count, decay=2.0, move_weight=5.0, terminal_weight=1.0

@@ -12,7 +12,10 @@ from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.contract.signals import trusted_observation
 
-LANES, N, M, PREVIEW = 6, 4, 3, 40
+LANES = 6
+N = 4
+M = 3
+PREVIEW = 40
 BLOCK = 0.05  # [s]
 LIMITS = {
     "speed": {"limit_position": False},
@@ -30,12 +33,11 @@ LIMITS = {
 
 def gradient(config, J, e, ahead, plan):
     """The gradient of the criterion in the docstring of `MpcLaw`, term by term; the integral by quadrature."""
-    H, block = config.moves, config.horizon_time / config.moves
-    beta, alpha, Q = (
-        np.exp(-config.decay * block),
-        np.exp(-config.forgetting * block),
-        config.move_weight,
-    )
+    H = config.moves
+    block = config.horizon_time / config.moves
+    beta = np.exp(-config.decay * block)
+    alpha = np.exp(-config.forgetting * block)
+    Q = config.move_weight
     knots = np.concatenate([np.zeros((1, len(e))), ahead])
 
     def pull(tau, travel):
@@ -60,19 +62,23 @@ def gradient(config, J, e, ahead, plan):
 
 def half_spaces(config, spec, J, last, q, y, moves):
     """The limits in the docstring of `qp` as A x ≤ b, row by row."""
-    A, b, block = [], [], config.horizon_time / config.moves
+    A = []
+    b = []
+    block = config.horizon_time / config.moves
     most, last = spec.joint_velocity_limit * block, last / spec.period * block
     # The one constant step is made H times
     stretch = 1.0 if config.mode == "moves" else config.moves
 
     def add(t, direction, bound, before=slice(0)):
         row = np.zeros((moves, spec.n))
-        row[t], row[before] = direction, -direction
+        row[t] = direction
+        row[before] = -direction
         A.append(row.ravel())
         b.append(bound)
 
     for t in range(moves):
-        until, before = slice(t + 1), [t - 1] if t else slice(0)
+        until = slice(t + 1)
+        before = [t - 1] if t else slice(0)
         for joint, axis in enumerate(np.eye(spec.n)):
             for sign, limit in ((1.0, spec.joint_upper), (-1.0, -spec.joint_lower)):
                 add([t], sign * axis, most[joint])
@@ -88,10 +94,8 @@ def half_spaces(config, spec, J, last, q, y, moves):
 
 def random_lanes(rng, scale):
     """Return an observation of an arm near its position limits, references and Jacobians."""
-    q, y = (
-        rng.uniform(-0.28, 0.28, (LANES, N)),
-        rng.normal(scale=0.25, size=(LANES, M)) + [0.0, 0.0, 1.0],
-    )
+    q = rng.uniform(-0.28, 0.28, (LANES, N))
+    y = rng.normal(scale=0.25, size=(LANES, M)) + [0.0, 0.0, 1.0]
     way = rng.normal(scale=0.1 * scale, size=(LANES, 1 + PREVIEW, M)).cumsum(axis=1)
     reference = y[:, None] + scale * rng.normal(size=(LANES, 1, M)) + way
     look = trusted_observation(0.0, q, y, np.full(LANES, True), np.full((LANES, M), True))
@@ -111,9 +115,12 @@ def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_
         plant_spec(N, M, reach=0.3 if limits in {"position", "all"} else 6.0), period=period
     )
     config = MpcConfig(mode=mode, horizon_time=0.3, moves=6, delay=0.1, decay=8.0, **LIMITS[limits])
-    law, rng = MpcLaw(config, RobotKnowledge(spec, PREVIEW)), np.random.default_rng(7)
+    law = MpcLaw(config, RobotKnowledge(spec, PREVIEW))
+    rng = np.random.default_rng(7)
     observation, reference, J = random_lanes(rng, scale)
-    state, solved, active = law.start(observation), 0, 0
+    state = law.start(observation)
+    solved = 0
+    active = 0
     for _ in range(4):
         before = state
         state, velocity = law.command(before, Estimate(J), observation, reference)

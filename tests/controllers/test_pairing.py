@@ -27,7 +27,9 @@ class Following:
             spec=dataclasses.replace(SPEC, period=period),
             nominal_jacobian=NETWORK.jacobian,
         )
-        self.period, self.k, self.state = period, 0, None
+        self.period = period
+        self.k = 0
+        self.state = None
         delays = Delays(latency, 0.0, 0.0)
         self.stages = Estimation(
             ConstantEstimator(), knowledge, AidsConfig(**{**MAPPED, **aids}), delays
@@ -74,7 +76,8 @@ def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
 
 @pytest.mark.parametrize(("period", "latency"), [(0.05, 0.025), (0.05, 0.0875), (0.02, 0.05)])
 def test_a_latency_between_two_periods_is_found(period, latency):
-    fine, parts = path(4.0, period / 8), 8
+    fine = path(4.0, period / 8)
+    parts = 8
     y = late_features(fine, TURN, round(parts * latency / period))[::parts]
     made = Following(period).follow(
         fine[::parts], y + 2e-4 * np.random.default_rng(0).normal(size=y.shape)
@@ -85,7 +88,8 @@ def test_a_latency_between_two_periods_is_found(period, latency):
 
 @pytest.mark.parametrize("latency", [0.0, 0.06, 0.1, 0.25])
 def test_a_given_delay_is_used_as_it_is(latency):
-    made, q = Following(latency=latency, delay="given"), path(1.0)
+    made = Following(latency=latency, delay="given")
+    q = path(1.0)
     made.follow(q, late_features(q, TURN, 4))
     assert made.found["delay"] == pytest.approx(latency)
     exposed, before, moved, *_ = made.stages.pairing.past(made.pair, q[-1], 1)
@@ -106,17 +110,22 @@ def test_a_given_delay_is_used_as_it_is(latency):
 def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
     """At each delay the motions are jointly normal, with a covariance by prior, walks, model and frames."""
     monkeypatch.setattr(pairing, "RESOLUTION", PERIOD)
-    rng, sigma, count = np.random.default_rng(4), 0.025, 10
+    rng = np.random.default_rng(4)
+    sigma = 0.025
+    count = 10
     q = np.concatenate([np.zeros((1, N)), np.cumsum(rng.choice([-0.03, 0.03], (count, N)), axis=0)])
     y = late_features(q, np.eye(M), 1) + sigma * rng.normal(size=(count + 1, M))
     made = Following(
         noise="given", feature_noise=sigma, longest_delay=0.2, delay_margin=0.0
     ).follow(q, y)
-    J, dq, wanted = NETWORK.jacobian(q), np.diff(q, axis=0), []
+    J = NETWORK.jacobian(q)
+    dq = np.diff(q, axis=0)
+    wanted = []
     x = np.matvec((J[1:] + J[:-1]) / 2.0, dq)
     for d in range(5):
         H = np.concatenate([np.zeros((d, M + N)), np.hstack([x, dq])[: count - d]])
-        lengths, turns = np.linalg.norm(H[:, :M], axis=1), np.linalg.norm(H[:, M:], axis=1)
+        lengths = np.linalg.norm(H[:, :M], axis=1)
+        turns = np.linalg.norm(H[:, M:], axis=1)
         assert (lengths[d:] > sigma).all()
         S = sigma**2 * (2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
         S += (
@@ -129,9 +138,8 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
             (H[:, M:], pairing.REST_WALK, turns),
         ):
             S += walk**2 * np.minimum.outer(np.cumsum(way), np.cumsum(way)) * (part @ part.T)
-        density = (
-            multivariate_normal(np.zeros(count), S).logpdf((np.diff(y, axis=0) - H[:, :M]).T).sum()
-        )
+        misses = np.diff(y, axis=0) - H[:, :M]
+        density = multivariate_normal(np.zeros(count), S).logpdf(misses.T).sum()
         wanted.append(-2.0 * density)
     np.testing.assert_allclose(
         made.pair.scores - made.pair.scores[0], np.array(wanted) - wanted[0], rtol=1e-6
@@ -155,7 +163,8 @@ def test_on_a_steady_circle_the_delay_is_kept_as_its_beginning_showed_it(memory,
     J = np.random.default_rng(0).normal(size=(M, N))
     late = np.concatenate([q[:1], q[:-1]])
     y = late @ J.T + np.random.default_rng(1).normal(scale=0.0004, size=(401, M))
-    made, delays = Following(score_memory=memory), []
+    made = Following(score_memory=memory)
+    delays = []
     made.stages._nominal = lambda position: np.broadcast_to(J, (*np.shape(position)[:-1], M, N))
     for k in range(401):
         made.see(q[k], y[k])
@@ -164,7 +173,8 @@ def test_on_a_steady_circle_the_delay_is_kept_as_its_beginning_showed_it(memory,
 
 
 def test_lost_frames_do_not_mislead_jacobian_and_delay():
-    q, rng = path(6.0), np.random.default_rng(3)
+    q = path(6.0)
+    rng = np.random.default_rng(3)
     made = Following().follow(q, late_features(q, TURN, 2), rng.random(len(q)) < 0.5)
     assert made.found["delay"] == pytest.approx(2 * PERIOD, abs=1.01 * pairing.RESOLUTION)
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1
@@ -173,7 +183,8 @@ def test_lost_frames_do_not_mislead_jacobian_and_delay():
 @pytest.mark.parametrize("false", [[12], [12, 13, 14, 15], [12, 17, 18, 19, 26]])
 def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
     q = path(1.6)
-    y, valid = late_features(q, np.eye(M), 0), np.full(len(q), True)
+    y = late_features(q, np.eye(M), 0)
+    valid = np.full(len(q), True)
     y += 5e-4 * np.random.default_rng(5).normal(size=y.shape)
     valid[false] = False
     lost = Following(noise="given", feature_noise=5e-4).follow(q, y, valid)
@@ -186,10 +197,8 @@ def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
 
 def test_the_fifth_false_frame_in_a_row_is_believed():
     q = path(1.6)
-    y, doubted = (
-        late_features(q, np.eye(M), 0) + np.where(np.arange(len(q)) < 12, 0.0, 0.3)[:, None],
-        [],
-    )
+    y = late_features(q, np.eye(M), 0) + np.where(np.arange(len(q)) < 12, 0.0, 0.3)[:, None]
+    doubted = []
     made = Following(noise="given", feature_noise=5e-4).follow(q[:12], y[:12])
     for k in range(12, 17):
         made.see(q[k], y[k])
@@ -212,7 +221,8 @@ def test_a_frame_that_another_delay_explains_is_not_taken_for_a_false_one():
 @pytest.mark.parametrize("period", [0.05, 0.008])
 def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(period):
     q = path(5.0, period)
-    y, valid = late_features(q, TURN, 0), np.full(len(q), True)
+    y = late_features(q, TURN, 0)
+    valid = np.full(len(q), True)
     lost = slice(round(2.0 / period), round(4.0 / period))
     valid[lost] = False
     made = Following(period).follow(q[: lost.stop], y[: lost.stop], valid)
@@ -231,9 +241,12 @@ def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(p
 
 def test_a_jump_of_the_feature_is_no_motion_and_after_three_frames_any_map_is_possible_again():
     q = path(1.6)
-    made, y, moves = Following(), late_features(q, np.eye(M), 0), []
+    made = Following()
+    y = late_features(q, np.eye(M), 0)
+    moves = []
     made.follow(q[:30], y[:30])
-    before, known = made.state.jacobian, made.pair.bank[:, M:-1, :-1]
+    before = made.state.jacobian
+    known = made.pair.bank[:, M:-1, :-1]
     for k in range(30, 33):
         made.see(q[k], y[k] + 0.3)
         moves.append(int(made.found["camera_moves"]))
@@ -248,7 +261,8 @@ def test_a_camera_turned_without_a_jump_is_known_by_motions_that_it_cannot_expla
     """The camera turns about the ball itself: only motions show it."""
     q = path(4.5)
     noise = np.random.default_rng(2).normal(scale=1e-4, size=(len(q), M))
-    before, after = late_features(q, np.eye(M), 0), late_features(q, TURN, 0)
+    before = late_features(q, np.eye(M), 0)
+    after = late_features(q, TURN, 0)
     y = np.concatenate([before[:61], after[61:] - after[60] + before[60]]) + noise
     made = Following(delay="given").follow(q[:61], y[:61])
     made.follow(q[61:72], y[61:72])
@@ -269,7 +283,8 @@ def test_a_model_that_is_wrong_by_more_than_a_map_hides_neither_the_delay_nor_th
     """Two columns of the Jacobian differ: without E what a map leaves passes for noise."""
     rows = NETWORK.weights.copy()
     rows[-2:] *= -0.5
-    q, levels = path(4.0, seed=2), []
+    q = path(4.0, seed=2)
+    levels = []
     y = late_features(q, TURN, 2, dataclasses.replace(NETWORK, weights=rows))
     y = y + 2e-4 * np.random.default_rng(2).normal(size=y.shape)
     for deviation, walk in ((pairing.REST_DEVIATION, pairing.REST_WALK), (1e-9, 0.0)):
@@ -283,12 +298,11 @@ def test_a_model_that_is_wrong_by_more_than_a_map_hides_neither_the_delay_nor_th
 
 def test_a_feature_that_is_not_seen_teaches_nothing_whatever_its_last_frame_was():
     """The second feature is lost for a while, after a frame that was an outlier or not: the model hardly differs."""
-    q, found = path(3.0), []
+    q = path(3.0)
+    found = []
     for outlier in (0.0, 0.3):
-        y, made = (
-            late_features(q, TURN, 0),
-            Following(delay="given", noise="given", feature_noise=3e-4),
-        )
+        y = late_features(q, TURN, 0)
+        made = Following(delay="given", noise="given", feature_noise=3e-4)
         y[30, 1] += outlier
         for k in range(len(q)):
             made.see(q[k], y[k], np.array([True, not 30 < k < 40, True]))
@@ -298,10 +312,11 @@ def test_a_feature_that_is_not_seen_teaches_nothing_whatever_its_last_frame_was(
 
 
 def test_given_noise_is_not_identified():
-    stage, q = pairing.Pairing(AidsConfig(filter=True), KNOWLEDGE, 0.0), np.full(N, 0.01)
-    state = stage.advance(
-        stage.start(seen(np.zeros(N), np.zeros(M)), np.ones((M, N))), q, np.ones((M, N))
-    )
+    stage = pairing.Pairing(AidsConfig(filter=True), KNOWLEDGE, 0.0)
+    q = np.full(N, 0.01)
+    J = np.ones((M, N))
+    first = stage.start(seen(np.zeros(N), np.zeros(M)), J)
+    state = stage.advance(first, q, J)
     after, paired = stage.learn(state, np.full(M, 0.06), np.float64(PERIOD), np.full(M, True))
     np.testing.assert_array_equal(after.noise.variance, state.noise.variance)
     assert stage.noise(state) is None

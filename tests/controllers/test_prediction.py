@@ -28,10 +28,8 @@ NO_DELAYS = Delays(0.0, 0.0, 0.0)
 def answered(response, steps=40, length=4, joints=3):
     """A JointResponse that has seen random commands and their answers; and the commands, the newest last."""
     rng = np.random.default_rng(3)
-    made, commands = (
-        JointResponse.immediate(length, np.zeros(joints), PERIOD),
-        [np.zeros(joints)] * len(response),
-    )
+    made = JointResponse.immediate(length, np.zeros(joints), PERIOD)
+    commands = [np.zeros(joints)] * len(response)
     for _ in range(steps):
         made = made.learn(sum(g * commands[-1 - i] for i, g in enumerate(response)))
         commands.append(0.05 * rng.uniform(-1.0, 1.0, joints))
@@ -57,13 +55,13 @@ def test_at_first_an_arm_is_expected_to_follow_at_once():
 @pytest.mark.parametrize("window", [1, 2])
 def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_foreseen(window):
     """Over windows of two periods Δq and dq are sums over two periods, and each row counts half."""
-    rng, prior, q, commands = (
-        np.random.default_rng(4),
-        np.array([1.0, 0.0, 0.0]),
-        [0.0] * window,
-        [0.0] * 5,
-    )
-    made, rows, answers = JointResponse.immediate(3, np.zeros(1), PERIOD, window=window), [], []
+    rng = np.random.default_rng(4)
+    prior = np.array([1.0, 0.0, 0.0])
+    q = [0.0] * window
+    commands = [0.0] * 5
+    made = JointResponse.immediate(3, np.zeros(1), PERIOD, window=window)
+    rows = []
+    answers = []
     for _ in range(15):
         q.append(
             q[-1]
@@ -89,14 +87,13 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
 
 def identified(period, window, encoder_step=0.0):
     """Return true and found flight, (..., 3), and the found lead [s], at a delay and a lag of 0.05 s in closed form."""
-    rng, count = np.random.default_rng(1), round(0.6 / period)
+    rng = np.random.default_rng(1)
+    count = round(0.6 / period)
     true = JointResponse.given(0.05, 0.05, period, round(1.0 / period), np.zeros(3))
-    made, q, past, flights = (
-        JointResponse.immediate(count, np.zeros(3), period, window),
-        np.zeros(3),
-        [],
-        [],
-    )
+    made = JointResponse.immediate(count, np.zeros(3), period, window)
+    q = np.zeros(3)
+    past = []
+    flights = []
     goal = np.zeros(3)
     for k in range(round(6.0 / period)):
         reached = goal - true.flight()  # what is done of the commands up to now
@@ -136,7 +133,8 @@ class Quadratic:
     """Pair and estimate stages of the feature y = (q₀², 2 q₁²), with the past of a motion."""
 
     def __init__(self, past, time):
-        self.pairing, self.kept = self, past
+        self.pairing = self
+        self.kept = past
         pair = SimpleNamespace(base=self.ahead(None, NOW)[0])
         self.state = SimpleNamespace(
             learned=SimpleNamespace(pair=pair), last=SimpleNamespace(time=np.float64(time))
@@ -156,10 +154,8 @@ def predicted(past, look, feature, learned=True, share=None):
     """Return ŷ and z of a predictor with the filter, whose state held a feature z."""
     predictor = Predictor(AidsConfig(delay="given", filter=True), PERIOD, NO_DELAYS)
     predictor = predictor if share is None else predictor.frozen(share)
-    state, stages = (
-        predictor.start(look)._replace(feature=np.asarray(feature)),
-        Quadratic(past, look.time - (not learned)),
-    )
+    state = predictor.start(look)._replace(feature=np.asarray(feature))
+    stages = Quadratic(past, look.time - (not learned))
     state, ahead, _, J = predictor.predict(state, stages, stages.state, look)
     np.testing.assert_array_equal(J, np.diag([2.0, 4.0]) * look.joint_position)
     return ahead.feature, state.feature
@@ -169,7 +165,9 @@ def at(q):
     return np.array([q[0] ** 2, 2.0 * q[1] ** 2])
 
 
-EXPOSED, BEFORE, NOW = np.array([0.5, -0.3]), np.array([0.1, 0.2]), np.array([0.9, 0.4])
+EXPOSED = np.array([0.5, -0.3])
+BEFORE = np.array([0.1, 0.2])
+NOW = np.array([0.9, 0.4])
 MOVING = Past(EXPOSED, BEFORE, (np.zeros(2), np.zeros(2)), np.zeros(2), np.array([0.03, -0.02]))
 
 
@@ -207,12 +205,12 @@ class Seeing:
 
     def __init__(self, arm, delays=NO_DELAYS, **aids):
         config = AidsConfig(**aids)
-        self.arm, self.stages = arm, Estimation(ConstantEstimator(), KNOWLEDGE, config, delays)
-        self.predictor, self.look = Predictor(config, PERIOD, delays), arm.observe()
-        self.estimation, self.state = (
-            self.stages.start(self.look, A),
-            self.predictor.start(self.look),
-        )
+        self.arm = arm
+        self.stages = Estimation(ConstantEstimator(), KNOWLEDGE, config, delays)
+        self.predictor = Predictor(config, PERIOD, delays)
+        self.look = arm.observe()
+        self.estimation = self.stages.start(self.look, A)
+        self.state = self.predictor.start(self.look)
 
     def predict(self, noise=0.0):
         look = self.look.with_values(self.look.joint_position, self.look.feature + noise)
@@ -230,11 +228,9 @@ class Seeing:
 @pytest.mark.parametrize("noise", [0.001, 0.008])
 def test_at_rest_the_filter_averages(noise):
     """In the steady state z is noisy by σ √(L/2), with the share L = r √T / σ of each frame."""
-    rng, made, errors = (
-        np.random.default_rng(5),
-        Seeing(ToyArm(np.eye(M)), noise="identified", filter=True),
-        [],
-    )
+    rng = np.random.default_rng(5)
+    made = Seeing(ToyArm(np.eye(M)), noise="identified", filter=True)
+    errors = []
     for _ in range(900):
         errors.append(made.predict(rng.normal(scale=noise, size=M)).feature)
         made.send(np.zeros(N))
@@ -245,7 +241,8 @@ def test_at_rest_the_filter_averages(noise):
 def test_in_motion_the_filter_halves_the_noise_and_an_outlier_does_not_pass():
     found = []
     for filter_ in (True, False):
-        rng, errors = np.random.default_rng(6), []
+        rng = np.random.default_rng(6)
+        errors = []
         made = Seeing(
             ToyArm(np.eye(M)), delay="given", noise="identified", model="regression", filter=filter_
         )
@@ -268,7 +265,8 @@ def test_in_motion_the_filter_halves_the_noise_and_an_outlier_does_not_pass():
 
 
 def test_frozen_at_rest_it_filters_as_it_did_when_it_learned():
-    rng, made = np.random.default_rng(5), Seeing(ToyArm(np.eye(M)), filter=True)
+    rng = np.random.default_rng(5)
+    made = Seeing(ToyArm(np.eye(M)), filter=True)
     for _ in range(60):
         made.predict(rng.normal(scale=1e-3, size=M))
         made.send(np.zeros(N))
@@ -287,11 +285,10 @@ def test_frozen_at_rest_it_filters_as_it_did_when_it_learned():
     "aids", [{"delay": "identified"}, {"delay": "given", "filter": True}], ids=["found", "given"]
 )
 def test_the_prediction_is_where_the_arm_ends_up_once_its_response_is_known(aids):
-    arm, rng = ToyArm(np.eye(M), (0.0, 0.6, 0.4), latency=2), np.random.default_rng(0)
-    made, joints = (
-        Seeing(arm, Delays(0.1, 0.0, 0.0), response="identified", model="nominal", **aids),
-        [],
-    )
+    arm = ToyArm(np.eye(M), (0.0, 0.6, 0.4), latency=2)
+    rng = np.random.default_rng(0)
+    made = Seeing(arm, Delays(0.1, 0.0, 0.0), response="identified", model="nominal", **aids)
+    joints = []
     for k in range(60):
         bound = made.predict()
         if k > 30:
@@ -306,7 +303,8 @@ def test_the_prediction_is_where_the_arm_ends_up_once_its_response_is_known(aids
 @pytest.mark.parametrize(("delay", "lag"), [(0.05, 0.05), (0.08, 0.03), (0.0, 0.1), (0.8, 0.0)])
 def test_a_given_response_is_that_of_a_delayed_lag(delay, lag):
     """The arm is simulated by scipy in steps of a millisecond: once it rests it is where it was predicted to be."""
-    rng, substeps = np.random.default_rng(2), 50
+    rng = np.random.default_rng(2)
+    substeps = 50
     made = Seeing(ToyArm(np.eye(M)), Delays(0.0, delay, lag), response="given")
     steps = np.concatenate([0.05 * rng.uniform(-1.0, 1.0, (30, N)), np.zeros((30, N))])
     held = np.repeat(steps / PERIOD, substeps, axis=0)

@@ -14,9 +14,12 @@ from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import stack, take
 
 FRAME = 0.49  # σ²
-N, M, PERIOD = 4, 3, 0.05
+N = 4
+M = 3
+PERIOD = 0.05
 QUADRATIC = N + N * (N + 1) // 2  # columns of E and H
-LOWER, UPPER = np.array([-1.0, -0.5, 0.0, 0.2]), np.array([1.0, 0.9, 0.8, 1.0])
+LOWER = np.array([-1.0, -0.5, 0.0, 0.2])
+UPPER = np.array([1.0, 0.9, 0.8, 1.0])
 KNOWLEDGE = RobotKnowledge(plant_spec(N, M), 0, region=(LOWER, UPPER))
 TURN = Rotation.from_rotvec([0.4, -0.3, 1.5]).as_matrix()
 
@@ -48,7 +51,8 @@ def learned(bank, h, dy, model, frame=FRAME, walk=0.0, learns=True):
 def filtered(x, dy, model, variance=0.7, frame=FRAME, **options):
     """Return the bank of one filter, with W = I at first, after motions, and its innovations."""
     size = x.shape[1]
-    bank, found = fresh_bank(np.eye(size), np.full(size, variance), frame), []
+    bank = fresh_bank(np.eye(size), np.full(size, variance), frame)
+    found = []
     for k in range(len(x)):
         bank, innovation = learned(bank, x[k], dy[k], model[k], frame, **options)
         found.append(innovation)
@@ -66,9 +70,11 @@ def test_the_filter_is_generalised_least_squares_around_the_prior(m):
     x, dy, model = motions(30, m)
     bank, found = filtered(x, dy, model)
     assert (found.variance == found.capped).all()
-    information = np.eye(m) / 0.7 + x.T @ np.linalg.solve(moving_average(model), x)
+    prior = np.eye(m) / 0.7
+    weighted = np.linalg.solve(moving_average(model), x)
+    information = prior + x.T @ weighted
     np.testing.assert_allclose(np.linalg.inv(bank[m:-1, :-1]), information, rtol=1e-9, atol=1e-9)
-    wanted = np.eye(m) / 0.7 + dy.T @ np.linalg.solve(moving_average(model), x)
+    wanted = prior + dy.T @ weighted
     np.testing.assert_allclose(bank[:m, :m] @ information, wanted, atol=1e-9)
 
 
@@ -130,8 +136,10 @@ class Walking:
     """A regression with the state of one run, and the motions that it got."""
 
     def __init__(self, knowledge=KNOWLEDGE, sigma=1e-3):
-        self.stage, self.frame = Regression(knowledge), np.float64(sigma**2)
-        self.state, self.seen = self.stage.start((), sigma**2), []
+        self.stage = Regression(knowledge)
+        self.frame = np.float64(sigma**2)
+        self.state = self.stage.start((), sigma**2)
+        self.seen = []
 
     def move(self, middle, step, x, dy):
         given = (middle, step, x, dy, np.float64(PERIOD))
@@ -145,7 +153,8 @@ class Walking:
         rng = np.random.default_rng(seed)
         shift = np.sqrt(self.frame) * rng.normal(size=(count + 1, M)) if shift is None else shift
         for k in range(count):
-            q, step = rng.uniform(LOWER, UPPER), size * rng.normal(size=N)
+            q = rng.uniform(LOWER, UPPER)
+            step = size * rng.normal(size=N)
             dy = feature(q + step) - feature(q) + shift[k + 1] - shift[k]
             self.move(q + step / 2, step, nominal @ step, dy)
         return self
@@ -160,7 +169,8 @@ NOMINAL = 0.5 * np.random.default_rng(1).normal(size=(M, N))
 def quadratic(seed=3):
     """Return a feature that is quadratic in q, and its coefficients about the centre of the region."""
     rng = np.random.default_rng(seed)
-    A, B = 0.3 * rng.normal(size=(M, N)), 0.3 * rng.normal(size=(M, N, N))
+    A = 0.3 * rng.normal(size=(M, N))
+    B = 0.3 * rng.normal(size=(M, N, N))
     B = B + B.swapaxes(1, 2)
 
     def feature(q):
@@ -178,10 +188,12 @@ def differences(feature, q, h=1e-5):
 
 def test_a_feature_that_is_quadratic_in_the_joints_is_explained_exactly():
     feature, A, B = quadratic()
-    run, rng = Walking(), np.random.default_rng(4)
+    run = Walking()
+    rng = np.random.default_rng(4)
     run.state = run.state._replace(mean=np.concatenate([A, B, TURN, np.ones((M, 1))], axis=1))
     for _ in range(5):
-        q, step = rng.uniform(LOWER, UPPER), rng.normal(size=N)
+        q = rng.uniform(LOWER, UPPER)
+        step = rng.normal(size=N)
         np.testing.assert_allclose(run.jacobian(q, NOMINAL), differences(feature, q), atol=1e-9)
         explained = run.stage.explained(
             run.state, run.stage.regressors(q + step / 2, step, NOMINAL @ step)
@@ -192,10 +204,11 @@ def test_a_feature_that_is_quadratic_in_the_joints_is_explained_exactly():
 def regressors(middle, step, x):
     """Return [Δq, the products of r and Δq, x] with products as differences of r_j r_k, or of r_j²/2."""
     first, second = np.triu_indices(N)
-    begin, end = (middle + sign * step / 2 - (LOWER + UPPER) / 2 for sign in (-1.0, 1.0))
-    products = (end[first] * end[second] - begin[first] * begin[second]) * np.where(
-        first == second, 0.5, 1.0
-    )
+    centre = (LOWER + UPPER) / 2
+    begin = middle - step / 2 - centre
+    end = middle + step / 2 - centre
+    factors = np.where(first == second, 0.5, 1.0)
+    products = (end[first] * end[second] - begin[first] * begin[second]) * factors
     return np.concatenate([step, products, x])
 
 
@@ -207,7 +220,7 @@ def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypa
     H = np.array([regressors(*each[:3]) for each in run.seen])
     y = np.array([dy - x for *_, x, dy, _ in run.seen])
     lengths = np.linalg.norm(H[:, :N], axis=1)
-    # What two motions share of the walk
+    # Two motions share the walk up to the end of the first one.
     walked = np.minimum.outer(np.cumsum(lengths), np.cumsum(lengths))
     odds = -0.5 * stage.PRIOR
     for b, deviation in enumerate(stage.DEVIATIONS):
@@ -226,9 +239,8 @@ def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypa
 def test_a_short_motion_changes_the_noise_of_the_frame_and_nothing_else():
     run = Walking(sigma=3e-3).follow(14, lambda q: NOMINAL @ q, NOMINAL)
     before = run.state
-    run.follow(
-        1, lambda q: NOMINAL @ q, NOMINAL, size=1e-4, shift=np.array([[0.0] * M, [0.004] * M])
-    )
+    shift = np.array([[0.0] * M, [0.004] * M])
+    run.follow(1, lambda q: NOMINAL @ q, NOMINAL, size=1e-4, shift=shift)
     np.testing.assert_array_equal(run.state.bank[:, :-1, :-1], before.bank[:, :-1, :-1])
     np.testing.assert_array_equal(run.stage.weights(run.state), run.stage.weights(before))
     assert (run.state.mean[:, -1] > before.mean[:, -1]).all()
@@ -237,9 +249,11 @@ def test_a_short_motion_changes_the_noise_of_the_frame_and_nothing_else():
 def test_maps_near_rotations_are_completed_and_all_else_moves_along_as_jointly_gaussian():
     """Given that M + N(0, ς²) is R, W has its conditional mean; R solves Wahba's problem by the axes of the weight."""
     run = Walking(sigma=3e-3).follow(6, lambda q: TURN @ NOMINAL @ q, NOMINAL)
-    weights, wanted = softmax(-0.5 * run.state.scores), 0.0
+    weights = softmax(-0.5 * run.state.scores)
+    wanted = 0.0
     for b, bank in enumerate(run.state.bank):
-        W, P = bank[:M], bank[M:]
+        W = bank[:M]
+        P = bank[M:]
         if b == len(stage.ROTATION_DEVIATIONS):
             wanted = wanted + weights[b] * W
             break
@@ -265,10 +279,12 @@ def jumping(shift, count=60):
 @pytest.mark.parametrize("frames", [1, 2])
 def test_outliers_go_into_the_noise_of_their_frames_and_leave_the_model_alone(frames):
     outliers = np.array([[0.3, -0.2, 0.1], [-0.2, 0.3, 0.2]])[:frames]
-    run, without = jumping(outliers, 40 + frames), jumping(np.zeros((frames, M)), 40 + frames)
+    run = jumping(outliers, 40 + frames)
+    without = jumping(np.zeros((frames, M)), 40 + frames)
     np.testing.assert_allclose(run.state.mean[:, -1], outliers[-1], atol=0.03)
     assert run.state.share > 0.95 > 0.7 > without.state.share
-    run, without = jumping(outliers), jumping(np.zeros((frames, M)))
+    run = jumping(outliers)
+    without = jumping(np.zeros((frames, M)))
     error = np.linalg.norm(without.jacobian(UPPER, NOMINAL) - TURN @ NOMINAL)
     assert (
         np.linalg.norm(run.jacobian(UPPER, NOMINAL) - without.jacobian(UPPER, NOMINAL))
@@ -278,10 +294,8 @@ def test_outliers_go_into_the_noise_of_their_frames_and_leave_the_model_alone(fr
 
 
 def test_three_frames_that_fit_only_one_another_are_a_moved_camera_and_three_outliers_are_not():
-    jump, apart = (
-        np.full((20, M), 0.3),
-        0.3 * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]]),
-    )
+    jump = np.full((20, M), 0.3)
+    apart = 0.3 * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
     moved = jumping(jump, 43)
     assert moved.state.moves == 1
     W = jumping(jump, 42).state.bank[..., :M, :-1]

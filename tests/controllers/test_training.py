@@ -35,7 +35,8 @@ from servobench.controllers.networks.fit import (
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid")]
-N, M = 3, 2
+N = 3
+M = 2
 SPEC = plant_spec(N, M)
 JACOBIAN = JacobianTraining(centres=40, samples=400)
 CONTROLLER = ControllerTraining(hidden=12, samples=500)
@@ -107,13 +108,12 @@ def test_the_damped_law_moves_in_weak_directions_which_the_truncated_one_leaves_
     def weak(q):
         return planar_jacobian(q) * np.array([[1.0], [0.01]])
 
-    unit, share = (
-        unit_points(50, controller_dimension(CONFIG, SPEC), np.random.default_rng(0)),
-        3.0 * CONTROLLER.step,
-    )
+    unit = unit_points(50, controller_dimension(CONFIG, SPEC), np.random.default_rng(0))
+    share = 3.0 * CONTROLLER.step
     plan = dataclasses.replace(CONFIG, controller=dataclasses.replace(CONTROLLER, damping=0.001))
     printed, damped = (controller_samples(unit, config, SPEC, weak) for config in (CONFIG, plan))
-    J, gain = weak(damped.position), damped.gain
+    J = weak(damped.position)
+    gain = damped.gain
     np.testing.assert_allclose(
         gain, share * np.linalg.solve(J.mT @ J + 1e-6 * np.eye(N), J.mT), rtol=1e-6
     )
@@ -123,7 +123,8 @@ def test_the_damped_law_moves_in_weak_directions_which_the_truncated_one_leaves_
 
 def test_ridge_solutions_equal_least_squares_on_augmented_rows():
     rng = np.random.default_rng(1)
-    F, Y = rng.normal(size=(30, 5)), rng.normal(size=(30, 2))
+    F = rng.normal(size=(30, 5))
+    Y = rng.normal(size=(30, 2))
     scale = np.linalg.eigvalsh(F.T @ F)[-1]
     for relative, W in zip((1e-3, 0.1), ridge_path(F, Y, (1e-3, 0.1)), strict=True):
         rows = np.vstack([F, np.sqrt(relative * scale) * np.eye(5)])
@@ -239,7 +240,8 @@ def stored_arrays(path):
 def test_corrupt_and_foreign_files_are_refused_in_one_line(tmp_path, networks):
     path = tmp_path / "networks.npz"
     save_networks(networks, path)
-    whole, arrays = path.read_bytes(), stored_arrays(path)
+    whole = path.read_bytes()
+    arrays = stored_arrays(path)
     damaged = bytearray(whole)
     damaged[len(whole) // 2] ^= 0xFF
     for content in (b"", b"text", whole[: len(whole) // 2], bytes(damaged), b"\x80\x04N."):
