@@ -20,19 +20,22 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, as_array
 
-YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # indices of the factors in a cross product
+# Indices of the factors in a cross product
+YZX = np.array([1, 2, 0])
+ZXY = np.array([2, 0, 1])
 
 
 def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
     """Return Rz(yaw) Ry(pitch) Rx(roll), shape (..., 3, 3), for `rpy` of shape (..., 3) in rad."""
     angles = np.asarray(rpy, dtype=np.float64)
-    (cr, cp, cy), (sr, sp, sy) = (np.moveaxis(f(angles), -1, 0) for f in (np.cos, np.sin))
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    # The suffixes are those of roll, pitch and yaw.
+    cr, cp, cy = np.moveaxis(np.cos(angles), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(angles), -1, 0)
+    x_row = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
+    y_row = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
+    z_row = [-sp, cp * sr, cp * cr]
+    rows = [np.stack(row, axis=-1) for row in (x_row, y_row, z_row)]
+    return np.stack(rows, axis=-2)
 
 
 def rpy_from_rotation(R: FloatArray) -> FloatArray:
@@ -41,9 +44,15 @@ def rpy_from_rotation(R: FloatArray) -> FloatArray:
     The yaw is removed before pitch and roll are computed, so that no angle depends on two vanishing numbers.
     """
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    c, s = np.cos(yaw), np.sin(yaw)
-    pitch = np.arctan2(-R[..., 2, 0], c * R[..., 0, 0] + s * R[..., 1, 0])
-    roll = np.arctan2(s * R[..., 0, 2] - c * R[..., 1, 2], c * R[..., 1, 1] - s * R[..., 0, 1])
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    # Sine and cosine of pitch and roll are entries of Rz(−yaw) R = Ry(pitch) Rx(roll).
+    sin_pitch = -R[..., 2, 0]
+    cos_pitch = c * R[..., 0, 0] + s * R[..., 1, 0]
+    sin_roll = s * R[..., 0, 2] - c * R[..., 1, 2]
+    cos_roll = c * R[..., 1, 1] - s * R[..., 0, 1]
+    pitch = np.arctan2(sin_pitch, cos_pitch)
+    roll = np.arctan2(sin_roll, cos_roll)
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
@@ -63,7 +72,8 @@ class SerialArm:
 
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
-        n, lead = self.n, np.shape(self.translation)[:-2]
+        n = self.n
+        lead = np.shape(self.translation)[:-2]
         shapes = {
             "translation": (n + 1, 3),
             "rpy": (n + 1, 3),
@@ -72,7 +82,8 @@ class SerialArm:
             "tool": (3,),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, as_array(name, getattr(self, name), lead + shape))
+            array = as_array(name, getattr(self, name), lead + shape)
+            object.__setattr__(self, name, array)
 
     @property
     def n(self) -> int:
@@ -106,24 +117,30 @@ class SerialArm:
             (..., n+1, 4, 4), m: entry i is the frame after joint i+1, the last one is the flange.
         """
         theta = self.joint_angle(joint_position)
-        lead, fixed = theta.shape[:-1], self._fixed
-        if fixed.ndim < 3 + len(lead):
-            fixed = fixed.reshape(
-                self.n + 1, *(1,) * (3 + len(lead) - fixed.ndim), *fixed.shape[1:]
-            )
-        angle = (theta if theta.ndim == 1 else np.moveaxis(theta, -1, 0))[..., None]
+        lead = theta.shape[:-1]
+        fixed = self._fixed
+        missing_axes = 3 + len(lead) - fixed.ndim
+        if missing_axes > 0:
+            fixed = fixed.reshape(self.n + 1, *(1,) * missing_axes, *fixed.shape[1:])
+        # The chain is the first axis here: the joints are multiplied one after the other, all leading axes at once.
+        angle = theta[..., None]
+        if lead:
+            angle = np.moveaxis(theta, -1, 0)[..., None]
+        c = np.cos(angle)
+        s = np.sin(angle)
+        x = fixed[:-1, ..., 0]
+        y = fixed[:-1, ..., 1]
         # A turn about z makes x c + y s and y c - x s of columns 0 and 1, and leaves the others as they are.
-        c, s, x, y = np.cos(angle), np.sin(angle), fixed[:-1, ..., 0], fixed[:-1, ..., 1]
-        turned, poses = np.empty((self.n, *lead, 4, 4)), np.empty((self.n + 1, *lead, 4, 4))
-        turned[..., 0], turned[..., 1], turned[..., 2:] = (
-            x * c + y * s,
-            y * c - x * s,
-            fixed[:-1, ..., 2:],
-        )
+        turned = np.empty((self.n, *lead, 4, 4))
+        turned[..., 0] = x * c + y * s
+        turned[..., 1] = y * c - x * s
+        turned[..., 2:] = fixed[:-1, ..., 2:]
+        steps = (*turned[1:], fixed[-1])
+        poses = np.empty((self.n + 1, *lead, 4, 4))
         poses[0] = turned[0]
-        for before, own, pose in zip(poses, (*turned[1:], fixed[-1]), poses[1:], strict=False):
-            np.matmul(before, own, out=pose)
-        return poses if theta.ndim == 1 else np.moveaxis(poses, 0, -3)
+        for before, step, pose in zip(poses, steps, poses[1:], strict=False):
+            np.matmul(before, step, out=pose)
+        return np.moveaxis(poses, 0, -3) if lead else poses
 
     def ball_position(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for joint positions (..., n) in rad."""
@@ -133,7 +150,8 @@ class SerialArm:
         """Return the ball centre, (..., 3) m, and its derivative by the reported (..., n) rad, (..., 3, n) m/rad."""
         frames = self.frames(joint_position)
         ball = self.ball(frames)
-        return ball, np.swapaxes(self.motions(frames, ball[..., None, :])[..., 0, :, :], -1, -2)
+        motions = self.motions(frames, ball[..., None, :])[..., 0, :, :]
+        return ball, np.swapaxes(motions, -1, -2)
 
     def motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
         """Return g_i z_i × (p − o_i), (..., p, n, 3) m/rad, for points (..., p, 3) m of the base frame and `frames`."""
@@ -177,15 +195,30 @@ def arm_from_dh(
         ValueError: a column of the wrong length.
     """
     n = len(joint_names)
-    size = n + 1 if modified and np.shape(a) == (n + 1,) else n
-    missing = (0, n + 1 - size) if modified else (1, 0)  # rows before and after those of the table
-    columns = ("a", a), ("d", d), ("alpha", alpha)
-    a_, d_, alpha_ = (np.pad(as_array(name, value, (size,)), missing) for name, value in columns)
-    y, z = (-d_ * np.sin(alpha_), d_ * np.cos(alpha_)) if modified else (np.zeros(n + 1), d_)
+    size = n
+    if modified and np.shape(a) == (n + 1,):
+        size = n + 1
+    # Zero rows before and after those of the table: the base, or the flange
+    missing = (0, n + 1 - size) if modified else (1, 0)
+    x = np.pad(as_array("a", a, (size,)), missing)
+    offset = np.pad(as_array("d", d, (size,)), missing)
+    roll = np.pad(as_array("alpha", alpha, (size,)), missing)
+    if modified:
+        # The offset is along the next joint's axis, which the twist has turned.
+        y = -offset * np.sin(roll)
+        z = offset * np.cos(roll)
+    else:
+        y = np.zeros(n + 1)
+        z = offset
     rpy = np.zeros((n + 1, 3))
-    rpy[:, 0] = alpha_
+    rpy[:, 0] = roll
     return SerialArm(
-        joint_names, np.stack([a_, y, z], axis=-1), rpy, np.zeros(n), np.ones(n), np.zeros(3)
+        joint_names=joint_names,
+        translation=np.stack([x, y, z], axis=-1),
+        rpy=rpy,
+        joint_offset=np.zeros(n),
+        gear_ratio=np.ones(n),
+        tool=np.zeros(3),
     )
 
 
@@ -199,8 +232,10 @@ class JointLimits:
 
     def __post_init__(self) -> None:
         """Check order and signs and freeze the arrays."""
+        n = len(self.lower)
         for name in ("lower", "upper", "speed"):
-            object.__setattr__(self, name, as_array(name, getattr(self, name), (len(self.lower),)))
+            array = as_array(name, getattr(self, name), (n,))
+            object.__setattr__(self, name, array)
         if not (self.lower < self.upper).all():
             came = f"{self.lower.tolist()} and {self.upper.tolist()}"
             raise ValueError(f"joint_lower must be below joint_upper for every joint, got {came}")
@@ -217,5 +252,7 @@ def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float
     if limits is None:
         return JointLimits(np.full(n, -reach), np.full(n, reach), np.full(n, speed))
     return JointLimits(
-        limits.lower.clip(-reach), limits.upper.clip(max=reach), limits.speed.clip(max=speed)
+        lower=limits.lower.clip(-reach),
+        upper=limits.upper.clip(max=reach),
+        speed=limits.speed.clip(max=speed),
     )

@@ -16,7 +16,8 @@ from annotated_types import Gt, Lt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import Count, Positive, settings
 
-PIXEL_CENTRE = (0.0, 1.0)  # [px] sampling point of TinyRenderer, from the pixel's upper left corner
+# Sampling point of TinyRenderer, from the pixel's upper left corner
+PIXEL_CENTRE = (0.0, 1.0)  # [px]
 IntArray: TypeAlias = npt.NDArray[np.intp]
 
 
@@ -42,18 +43,15 @@ class PinholeCamera:
 
     def reaching(self, distance: float) -> Self:
         """Return the camera with clipping planes that let a target at about this distance [m] be seen."""
-        return replace(
-            self, near=min(self.near, distance / 5.0), far=max(self.far, 1.75 * distance)
-        )
+        near = min(self.near, distance / 5.0)
+        far = max(self.far, 1.75 * distance)
+        return replace(self, near=near, far=far)
 
     def clipping(self, depths: npt.ArrayLike) -> str:
         """Return words on the clipping planes for an error message; none where all depths [m] are between them."""
-        between = f"not between the clipping planes at {self.near:.3g} and {self.far:.3g} m, "
-        return (
-            between
-            if np.less(depths, self.near).any() or np.greater(depths, self.far).any()
-            else ""
-        )
+        if np.less(depths, self.near).any() or np.greater(depths, self.far).any():
+            return f"not between the clipping planes at {self.near:.3g} and {self.far:.3g} m, "
+        return ""
 
     @property
     def focal(self) -> float:
@@ -63,8 +61,9 @@ class PinholeCamera:
     def project(self, p_C: npt.ArrayLike) -> FloatArray:
         """Return in which column and row, (..., 2) px, points (..., 3) m of the camera frame appear; undoes `rays`."""
         p = np.asarray(p_C, dtype=np.float64)
-        corner = (self.width / 2 - PIXEL_CENTRE[0], self.height / 2 - PIXEL_CENTRE[1])
-        return np.asarray(self.focal * p[..., :2] / p[..., 2:] + corner)
+        offset_u, offset_v = PIXEL_CENTRE
+        middle = (self.width / 2 - offset_u, self.height / 2 - offset_v)
+        return np.asarray(self.focal * p[..., :2] / p[..., 2:] + middle)
 
     def rays(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> FloatArray:
         """Return the rays (x/z, y/z, 1) through pixels.
@@ -76,29 +75,33 @@ class PinholeCamera:
         Returns:
             (k, 3); a ray times its metric depth is the point in the camera frame.
         """
-        u, v = np.asarray(columns, dtype=np.float64), np.asarray(rows, dtype=np.float64)
+        u = np.asarray(columns, dtype=np.float64)
+        v = np.asarray(rows, dtype=np.float64)
+        offset_u, offset_v = PIXEL_CENTRE
         rays = np.ones((u.size, 3))
-        rays[:, 0] = (u + (PIXEL_CENTRE[0] - self.width / 2)) / self.focal
-        rays[:, 1] = (v + (PIXEL_CENTRE[1] - self.height / 2)) / self.focal
+        rays[:, 0] = (u + (offset_u - self.width / 2)) / self.focal
+        rays[:, 1] = (v + (offset_v - self.height / 2)) / self.focal
         return rays
 
     def metric_depth(self, buffer: npt.ArrayLike) -> FloatArray:
         """Return the depth along the optical axis, m, for OpenGL depth-buffer values in [0, 1] of any shape."""
         value = np.asarray(buffer, dtype=np.float64)
-        return np.asarray(self.near * self.far / (self.far - (self.far - self.near) * value))
+        near = self.near
+        far = self.far
+        return np.asarray(near * far / (far - (far - near) * value))
 
     def projection_matrix(self) -> FloatArray:
         """Return the OpenGL projection matrix, (4, 4)."""
         f = 1.0 / np.tan(np.radians(self.vertical_fov) / 2)
-        near, far = self.near, self.far
-        return np.array(
-            [
-                [f * self.height / self.width, 0.0, 0.0, 0.0],
-                [0.0, f, 0.0, 0.0],
-                [0.0, 0.0, -(far + near) / (far - near), -2.0 * far * near / (far - near)],
-                [0.0, 0.0, -1.0, 0.0],
-            ]
-        )
+        near = self.near
+        far = self.far
+        matrix = np.zeros((4, 4))
+        matrix[0, 0] = f * self.height / self.width
+        matrix[1, 1] = f
+        matrix[2, 2] = -(far + near) / (far - near)
+        matrix[2, 3] = -2.0 * far * near / (far - near)
+        matrix[3, 2] = -1.0
+        return matrix
 
 
 CAMERA: Final = PinholeCamera()  # planned camera of the bench
@@ -106,8 +109,10 @@ CAMERA: Final = PinholeCamera()  # planned camera of the bench
 
 def view_matrix(X_BC: FloatArray) -> FloatArray:
     """Return the OpenGL view matrix, (4, 4), of a camera at X_BC (4, 4); OpenGL has y up and looks along −z."""
-    R, p = X_BC[:3, :3], X_BC[:3, 3]
+    R = X_BC[:3, :3]
+    p = X_BC[:3, 3]
+    flipped = np.array([[1.0], [-1.0], [-1.0]])
     view = np.eye(4)
-    view[:3, :3] = np.array([[1.0], [-1.0], [-1.0]]) * R.T
+    view[:3, :3] = flipped * R.T
     view[:3, 3] = -view[:3, :3] @ p
     return view

@@ -22,7 +22,8 @@ from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
 # The ball centre, camera frame
 FEATURE = Channel(("x", "y", "z"), "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))
 SERIES_ANGLE = 1e-3  # [rad] below it, sin(α/2)/α is a series
-ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
+# Largest deviation of the entries of R Rᵀ from those of the identity
+ROTATION_TOLERANCE = 1e-9  # [1]
 # Shares of the way to a posture at which features are sought
 WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)
 
@@ -103,12 +104,16 @@ class RobotModel(ABC):
         q = np.asarray(joint_position, dtype=np.float64)
         if self.valid(home) is None:
             return self.jacobian(q)
-        nearer, reached = q, np.zeros(q.shape[:-1], dtype=np.bool_)
+        nearer = q
+        reached = np.zeros(q.shape[:-1], dtype=np.bool_)
         for share in WAY_FROM_HOME:
             tried = home + share * (q - home)
+            first_valid = ~reached
             valid = self.valid(tried)
-            here = ~reached if valid is None else valid.all(axis=-1) & ~reached
-            nearer, reached = np.where(here[..., None], tried, nearer), reached | here
+            if valid is not None:
+                first_valid = valid.all(axis=-1) & ~reached
+            nearer = np.where(first_valid[..., None], tried, nearer)
+            reached = reached | first_valid
         return self.jacobian(np.where(reached[..., None], nearer, home))
 
     def turned(self, rotation: FloatArray, centre: npt.ArrayLike) -> Self:
@@ -123,19 +128,28 @@ def rotation_matrix(vector: npt.ArrayLike) -> FloatArray:
     `Rotation`, which takes a quarter of a second to load.
     """
     v = np.asarray(vector, dtype=np.float64)
-    square = (v[..., :1] * v[..., :1] + v[..., 1:2] * v[..., 1:2]) + v[..., 2:] * v[..., 2:]
-    angle = np.sqrt(square)
-    near, square = angle <= SERIES_ANGLE, angle**2
-    quotient = np.where(
-        near, 0.5 - square / 48 + square**2 / 3840, np.sin(angle / 2) / (angle + near)
-    )
+    v1 = v[..., :1]
+    v2 = v[..., 1:2]
+    v3 = v[..., 2:]
+    angle = np.sqrt((v1 * v1 + v2 * v2) + v3 * v3)
+    near = angle <= SERIES_ANGLE
+    # scipy takes the square of the rounded angle.
+    square = angle**2
+    series = 0.5 - square / 48 + square**2 / 3840
+    # The angle of near ones is raised by 1, which avoids a division by zero and is not used.
+    exact = np.sin(angle / 2) / (angle + near)
+    quotient = np.where(near, series, exact)
     x, y, z = np.moveaxis(v * quotient, -1, 0)
     w = np.cos(angle / 2)[..., 0]
-    xx, yy, zz, ww = x * x, y * y, z * z, w * w
-    first = xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)
-    second = 2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)
-    third = 2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww
-    return np.stack([np.stack(row, axis=-1) for row in (first, second, third)], axis=-2)
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    ww = w * w
+    x_row = [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)]
+    y_row = [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)]
+    z_row = [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww]
+    rows = [np.stack(row, axis=-1) for row in (x_row, y_row, z_row)]
+    return np.stack(rows, axis=-2)
 
 
 def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> FloatArray:
@@ -143,10 +157,12 @@ def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> Flo
 
     The point has the same coordinates in the turned frame as before.
     """
-    own = pose[:3, :3].T @ (point - pose[:3, 3])
+    R = pose[:3, :3]
+    p = pose[:3, 3]
+    own_point = R.T @ (point - p)
     turned = np.eye(4)
-    turned[:3, :3] = pose[:3, :3] @ rotation_matrix(rotation)
-    turned[:3, 3] = point - turned[:3, :3] @ own
+    turned[:3, :3] = R @ rotation_matrix(rotation)
+    turned[:3, 3] = point - turned[:3, :3] @ own_point
     return turned
 
 
@@ -162,8 +178,10 @@ class HandEyeModel(RobotModel):
         """Check that the camera pose is a rigid transform and freeze it."""
         pose = as_array("X_BC", self.X_BC, (*self.lead, 4, 4))
         R = pose[..., :3, :3]
-        deviation = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
-        if deviation > ROTATION_TOLERANCE or (np.linalg.det(R) < 0.0).any():
+        product = R @ np.swapaxes(R, -1, -2)
+        deviation = np.abs(product - np.eye(3)).max(initial=0.0)
+        is_mirrored = np.linalg.det(R) < 0.0
+        if deviation > ROTATION_TOLERANCE or is_mirrored.any():
             raise ValueError("X_BC must hold a rotation matrix")
         object.__setattr__(self, "X_BC", pose)
 
@@ -187,18 +205,18 @@ class HandEyeModel(RobotModel):
     def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, None]:
         """Return the ball centre in the camera frame, (..., 3) m, and its Jacobian, (..., 3, n) m/rad."""
         p_B, J_B = self.arm.ball_and_jacobian(joint_position)
-        y, J = self.to_camera(p_B), np.asarray(np.swapaxes(self.X_BC[..., :3, :3], -1, -2) @ J_B)
+        R_CB = np.swapaxes(self.X_BC[..., :3, :3], -1, -2)
+        y = self.to_camera(p_B)
+        J = np.asarray(R_CB @ J_B)
         y.setflags(write=False)
         J.setflags(write=False)
         return y, J, None
 
     def to_camera(self, p_B: npt.ArrayLike) -> FloatArray:
         """Return points of the base frame in the camera frame, (..., 3) m."""
-        return np.asarray(
-            np.vecmat(
-                np.asarray(p_B, dtype=np.float64) - self.X_BC[..., :3, 3], self.X_BC[..., :3, :3]
-            )
-        )
+        p = np.asarray(p_B, dtype=np.float64)
+        from_camera = p - self.X_BC[..., :3, 3]
+        return np.asarray(np.vecmat(from_camera, self.X_BC[..., :3, :3]))
 
     def to_base(self, p_C: npt.ArrayLike) -> FloatArray:
         """Return points of the camera frame in the base frame, (..., 3) m."""
@@ -231,11 +249,11 @@ def hand_eye_spec(
         period: control period, s.
         max_joint_speed: rad/s, the same for all joints.
         joint_range: rad, each way, the same for all joints.
-        limits: of its maker, which hold as well; None for none.
+        limits: the maker's, which hold as well; None for none.
 
     Raises:
         ValueError: a period, speed or range that is not positive.
     """
-    both = narrow_limits(limits, model.arm.n, max_joint_speed, joint_range)
-    command = Channel(model.arm.joint_names, "rad/s", 1.0, -both.speed, both.speed)
-    return PlantSpec(model.channel, command, both.lower, both.upper, period)
+    narrowed = narrow_limits(limits, model.arm.n, max_joint_speed, joint_range)
+    command = Channel(model.arm.joint_names, "rad/s", 1.0, -narrowed.speed, narrowed.speed)
+    return PlantSpec(model.channel, command, narrowed.lower, narrowed.upper, period)

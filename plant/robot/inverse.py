@@ -29,7 +29,9 @@ ITERATIONS: Final = 120
 CLOSE_ENOUGH: Final = 1e-6  # [m] a point counts as reached, and the search for it ends
 FIRST_DAMPING: Final = 1e-2  # [m²]
 DAMPING_BOUNDS: Final = (1e-9, 1e6)  # [m²]
-SHRINK, GROW = 0.3, 4.0  # factors on the damping after an accepted and after a rejected step
+# Factors on the damping after an accepted and after a rejected step
+SHRINK: Final = 0.3
+GROW: Final = 4.0
 Limits = tuple[FloatArray, FloatArray]  # lower and upper joint positions, (n,) and (n,) [rad]
 
 
@@ -45,17 +47,24 @@ def closest_distance(
         upper: (n,) [rad].
 
     Returns:
-        (...) [m]; of a point that can be reached, at most `CLOSE_ENOUGH`.
+        (...) [m]; for a point that can be reached, at most `CLOSE_ENOUGH`.
     """
-    target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
-    lead, n = target.shape[:-1], len(low)  # all points have the same starts, within a turn
-    drawn = np.random.default_rng(0).uniform(
-        np.maximum(low, -np.pi), np.minimum(high, np.pi), (STARTS, n)
-    )
-    starts = np.broadcast_to(drawn.reshape(STARTS, *(1,) * len(lead), n), (STARTS, *lead, n))
-    _, distance = _search(
-        arm, target, starts, (low, high), lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH
-    )
+    target = np.asarray(point, dtype=np.float64)
+    low = np.asarray(lower, dtype=np.float64)
+    high = np.asarray(upper, dtype=np.float64)
+    lead = target.shape[:-1]
+    n = len(low)
+    # All points have the same starts, within a turn.
+    within_turn = np.maximum(low, -np.pi), np.minimum(high, np.pi)
+    drawn = np.random.default_rng(0).uniform(*within_turn, (STARTS, n))
+    drawn = drawn.reshape(STARTS, *(1,) * len(lead), n)
+    starts = np.broadcast_to(drawn, (STARTS, *lead, n))
+
+    def is_reached(distance: FloatArray) -> BoolArray:
+        """One start that reaches a point ends the search for it from all starts."""
+        return np.asarray(distance.min(axis=0) <= CLOSE_ENOUGH)
+
+    _, distance = _search(arm, target, starts, (low, high), is_reached)
     return np.asarray(distance.min(axis=0))
 
 
@@ -74,8 +83,13 @@ def reach_for(
     Returns:
         Joint positions (k, n) [rad], and how far the ball is from the point (k,) [m].
     """
+
+    def is_reached(distance: FloatArray) -> BoolArray:
+        """The search from a start ends for itself, also where its distance is no number."""
+        return ~(distance > CLOSE_ENOUGH)
+
     target = np.broadcast_to(point, (len(starts), 3))
-    return _search(arm, target, starts, (lower, upper), lambda distance: ~(distance > CLOSE_ENOUGH))
+    return _search(arm, target, starts, (lower, upper), is_reached)
 
 
 def _search(
@@ -83,31 +97,37 @@ def _search(
     target: FloatArray,
     q: FloatArray,
     limits: Limits,
-    find: Callable[[FloatArray], BoolArray],
+    is_reached: Callable[[FloatArray], BoolArray],
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint positions (starts, ..., n) rad near targets (..., 3) m, and their distances from it (starts, ...) m.
 
-    The search begins at `q`, (starts, ..., n) rad, and ends for those of which `find` says so of the distances.
+    The search begins at `q`, (starts, ..., n) rad, and ends for those whose distances `is_reached` accepts.
     """
-    lead, q, target = (
-        arm.translation.ndim - 2,
-        q.copy(),
-        np.broadcast_to(target, (*q.shape[:-1], 3)),
-    )
+    arm_axes = arm.translation.ndim - 2
+    q = q.copy()
+    target = np.broadcast_to(target, (*q.shape[:-1], 3))
     error, J = _error(arm, target, q)
-    distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
+    distance = norm(error)
+    damping = np.full(q.shape[:-1], FIRST_DAMPING)
     for _ in range(ITERATIONS):
-        left = np.nonzero(np.broadcast_to(~find(distance), distance.shape))
+        open_ones = np.broadcast_to(~is_reached(distance), distance.shape)
+        left = np.nonzero(open_ones)
         if not left[0].size:
             break
         tried = _step(q[left], error[left], J[left], damping[left], *limits)
-        new_error, new_J = _error(take(arm, left[-lead:]) if lead else arm, target[left], tried)
+        own_arm = arm
+        if arm_axes:
+            own_arm = take(arm, left[-arm_axes:])
+        new_error, new_J = _error(own_arm, target[left], tried)
         new_distance = norm(new_error)
         nearer = new_distance < distance[left]
-        damping[left] = np.clip(damping[left] * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
-        moved = tuple(each[nearer] for each in left)
-        q[moved], distance[moved] = tried[nearer], new_distance[nearer]
-        error[moved], J[moved] = new_error[nearer], new_J[nearer]
+        factor = np.where(nearer, SHRINK, GROW)
+        damping[left] = np.clip(damping[left] * factor, *DAMPING_BOUNDS)
+        moved = tuple(index[nearer] for index in left)
+        q[moved] = tried[nearer]
+        distance[moved] = new_distance[nearer]
+        error[moved] = new_error[nearer]
+        J[moved] = new_J[nearer]
     return q, distance
 
 
@@ -127,21 +147,23 @@ def _step(
 ) -> FloatArray:
     """Return the joint positions after a damped step, (..., n) rad, within the limits."""
     downhill = np.vecmat(error, J)
-    free = ~((q <= lower) & (downhill < 0.0) | (q >= upper) & (downhill > 0.0))
+    leaves_below = (q <= lower) & (downhill < 0.0)
+    leaves_above = (q >= upper) & (downhill > 0.0)
+    free = ~(leaves_below | leaves_above)
     J = J * free[..., None, :]
-    weighted = np.linalg.solve(plus_diagonal(J @ J.mT, damping[..., None]), error[..., None])[
-        ..., 0
-    ]
-    return np.asarray(np.clip(q + np.vecmat(weighted, J), lower, upper))
+    damped = plus_diagonal(J @ J.mT, damping[..., None])
+    weighted = np.linalg.solve(damped, error[..., None])[..., 0]
+    step = np.vecmat(weighted, J)
+    return np.asarray(np.clip(q + step, lower, upper))
 
 
 POSE_ITERATIONS: Final = 100
-POSE_TOLERANCE: Final = (
-    1e-9  # error norm at which the search ends; lengths over the arm's, angles in rad
-)
+# The search ends at this norm of the error, with lengths over the arm's and angles in rad.
+POSE_TOLERANCE: Final = 1e-9  # [1]
 FIRST_POSE_DAMPING: Final = 1e-3
 # Factors on the damping after an accepted and after a rejected step
-POSE_SHRINK, POSE_GROW = (0.2, 5.0)
+POSE_SHRINK: Final = 0.2
+POSE_GROW: Final = 5.0
 
 
 def reach_pose(
@@ -160,16 +182,21 @@ def reach_pose(
         (n,) rad, and the norm of the error that is left: of the length over the arm's and the angle [rad].
     """
     length = float(np.linalg.norm(arm.translation, axis=-1).sum())
-    q, damping = np.clip(start, lower, upper), FIRST_POSE_DAMPING
+    q = np.clip(start, lower, upper)
+    damping = FIRST_POSE_DAMPING
     error, J = _pose_error(arm, pose, q, length)
     for _ in range(POSE_ITERATIONS):
         if np.linalg.norm(error) <= POSE_TOLERANCE:
             break
-        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
+        damped = J @ J.T + damping * np.eye(6)
+        step = J.T @ np.linalg.solve(damped, error)
         tried = np.clip(q + step, lower, upper)
         new_error, new_J = _pose_error(arm, pose, tried, length)
         if np.linalg.norm(new_error) < np.linalg.norm(error):
-            q, error, J, damping = tried, new_error, new_J, damping * POSE_SHRINK
+            q = tried
+            error = new_error
+            J = new_J
+            damping *= POSE_SHRINK
         else:
             damping *= POSE_GROW
     return q, float(np.linalg.norm(error))
@@ -182,9 +209,11 @@ def _pose_error(
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
     frames = arm.frames(q)
-    flange, axes = frames[-1], frames[: arm.n, :3, 2] * arm.gear_ratio[:, None]
-    turn = Rotation.from_matrix(pose[:3, :3] @ flange[:3, :3].T).as_rotvec()
-    moves = np.cross(axes, flange[:3, 3] - frames[: arm.n, :3, 3]) / length
-    return np.concatenate([(pose[:3, 3] - flange[:3, 3]) / length, turn]), np.vstack(
-        [moves.T, axes.T]
-    )
+    R = frames[-1, :3, :3]
+    p = frames[-1, :3, 3]
+    shift = (pose[:3, 3] - p) / length
+    turn = Rotation.from_matrix(pose[:3, :3] @ R.T).as_rotvec()
+    axes = frames[: arm.n, :3, 2] * arm.gear_ratio[:, None]
+    origins = frames[: arm.n, :3, 3]
+    moves = np.cross(axes, p - origins) / length
+    return np.concatenate([shift, turn]), np.vstack([moves.T, axes.T])

@@ -19,11 +19,10 @@ from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
-MAX_PART: Final = (
-    0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
-)
-# [rad/s] of a flexible tool: the closed form of its motion loses its digits below, and overflows far above.
-FREQUENCIES: Final = (0.1, 1e6)
+# In each part of a period play is updated once and the acceleration of a tool changes linearly.
+MAX_PART: Final = 0.005  # [s]
+# The closed form of a flexible tool's motion loses its digits below these frequencies, and overflows far above.
+FREQUENCIES: Final = (0.1, 1e6)  # [rad/s]
 Motion: TypeAlias = tuple[FloatArray, FloatArray]
 """p [m] and ṗ [m/s], (..., 3) each."""
 
@@ -65,8 +64,9 @@ class MechanicsConfig:
 
     def parts(self, period: float) -> int:
         """Return in how many parts a period [s] is integrated."""
-        off = self.tool_frequency == 0.0 and self.backlash == 0.0
-        return 1 if off else fewest_parts(period, MAX_PART)
+        if self.tool_frequency == 0.0 and self.backlash == 0.0:
+            return 1
+        return fewest_parts(period, MAX_PART)
 
     def transmitted(self, q: FloatArray) -> FloatArray:
         """Return g, (..., n) rad."""
@@ -83,30 +83,37 @@ class MechanicsConfig:
 
     def driven_velocity(self, x: FloatArray, q: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return ẋ, (..., n) rad/s, for q̇ (..., n): 0 of a joint that is within its play."""
-        g, speed = self.transmitted(q), self.slope(q) * velocity
-        return np.where(
-            np.where(speed > 0.0, x <= g - self.backlash, x >= g + self.backlash), speed, 0.0
-        )
+        g = self.transmitted(q)
+        speed = self.slope(q) * velocity
+        # A rising gear pushes the joint at the lower end of its play, a falling one at the upper end.
+        driven = np.where(speed > 0.0, x <= g - self.backlash, x >= g + self.backlash)
+        return np.where(driven, speed, 0.0)
 
     def swung(self, tool: Tool, before: Motion, after: Motion, time: float) -> Tool:
         """Return a flexible tool a time [s] later, in closed form for ṗ that is a parabola with the right distance.
 
-        With p̈ = α + 2 β t, δ is c₀ + c₁ t, c₁ = −2 β/ω², c₀ = −α/ω² − 2 ζ c₁/ω, and a decaying oscillation.
+        With p̈ = α + 2 β t, δ is c₀ + c₁ t, c₁ = −2 β/ω², c₀ = −α/ω² − 2 ζ c₁/ω, and a decaying oscillation of
+        frequency ω_d = √(ω² − σ²), σ = ζ ω, that begins with d = δ − c₀ and ḋ = w − ṗ − c₁:
+
+            e^(−σt) ((cos ω_d t + σ sin(ω_d t)/ω_d) d + sin(ω_d t)/ω_d ḋ)
         """
-        omega, sigma = self.tool_frequency, self.tool_damping * self.tool_frequency
+        omega = self.tool_frequency
+        sigma = self.tool_damping * self.tool_frequency
         damped = math.sqrt(omega**2 - sigma**2)
-        left, c, s = (
-            math.exp(-sigma * time),
-            math.cos(damped * time),
-            math.sin(damped * time) / damped,
-        )
-        (start, begin), (end, finish) = before, after
-        bend = 3.0 * (begin + finish) - 6.0 * (end - start) / time
-        drift = -2.0 * bend / (time**2 * omega**2)
-        centre = (begin - finish + bend) / (time * omega**2) - 2.0 * sigma * drift / omega**2
-        d, r = tool.deflection - centre, tool.velocity - begin - drift
-        deflection = centre + drift * time + left * ((c + sigma * s) * d + s * r)
-        return Tool(deflection, finish + drift + left * ((c - sigma * s) * r - omega**2 * s * d))
+        decay = math.exp(-sigma * time)
+        c = math.cos(damped * time)
+        s = math.sin(damped * time) / damped
+        p0, v0 = before
+        p1, v1 = after
+        # The bend is β T²: p₁ − p₀ = v₀ T + α T²/2 + β T³/3 and v₁ = v₀ + α T + β T².
+        bend = 3.0 * (v0 + v1) - 6.0 * (p1 - p0) / time
+        c1 = -2.0 * bend / (time**2 * omega**2)
+        c0 = (v0 - v1 + bend) / (time * omega**2) - 2.0 * sigma * c1 / omega**2
+        d = tool.deflection - c0
+        d_rate = tool.velocity - v0 - c1
+        deflection = c0 + c1 * time + decay * ((c + sigma * s) * d + s * d_rate)
+        swing_rate = decay * ((c - sigma * s) * d_rate - omega**2 * s * d)
+        return Tool(deflection, v1 + c1 + swing_rate)
 
     def check(self, model: RobotModel) -> None:
         """Refuse a flexible tool where the features are not the place of the ball.
@@ -127,15 +134,16 @@ def transmitted(q: FloatArray, ripple: float | FloatArray, order: float) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class RippledJacobian:
-    """A Jacobian by reported joint positions, of one by the joints behind gears without play."""
+    """A Jacobian by reported joint positions, made of one by the joints behind gears without play."""
 
     function: Callable[[FloatArray], FloatArray]
     mechanics: MechanicsConfig
 
     def __call__(self, joint_position: FloatArray) -> FloatArray:
         """Return J(g(q)) ∂g/∂q, (..., m, n), at (..., n) rad."""
-        own = self.mechanics.slope(joint_position)[..., None, :]
-        return self.function(self.mechanics.transmitted(joint_position)) * own
+        slope = self.mechanics.slope(joint_position)[..., None, :]
+        J = self.function(self.mechanics.transmitted(joint_position))
+        return J * slope
 
 
 MECHANICS_AXES: Final = {
