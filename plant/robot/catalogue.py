@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path, PurePath
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,7 @@ ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
 } | {"panda": panda}
 """The arms by their makers' tables; each is made once."""
 WITH: Final = " with "  # between a robot and the file of its camera
-# That files of robots have, and one that is refused
+# The suffixes of files of robots, and one that is refused
 SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf", ".xacro")
 
 
@@ -49,25 +49,27 @@ def find_robot(text: str) -> Robot:
     """
     word = read_word(text)
     if word.camera:
-        name = text.removesuffix(WITH + word.camera)
-        return _equipped(find_robot(name), word.camera, _changed("camera", user_path(word.camera)))
+        robot = find_robot(text.removesuffix(WITH + word.camera))
+        changed = _changed("camera", user_path(word.camera))
+        return _equipped(robot, word.camera, changed)
     if text in ROBOTS:
         return ROBOTS[text]()
     kind, _, number = text.partition(":")
     if kind == RANDOM_ARM:
-        if not (number.isascii() and number.isdigit() and len(number) <= len(str(MAX_NUMBER))):
+        is_number = number.isascii() and number.isdigit()
+        if not is_number or len(number) > len(str(MAX_NUMBER)):
             raise ValueError(
                 f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7"
             )
         return random_robot(int(number))
     path = user_path(word.robot)
-    if PurePath(text.partition("#")[0]).suffix.lower() == ".xacro":
+    before_link = text.partition("#")[0]
+    if PurePath(before_link).suffix.lower() == ".xacro":
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
         kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"
-        wanted = (
-            f"{suggest(text, ROBOTS)}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
-        )
+        known = suggest(text, ROBOTS)
+        wanted = f"{known}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
         raise ValueError(f"unknown robot {text!r}: {wanted}")
     return _read(text, _changed("robot", path))
 
@@ -82,16 +84,16 @@ class RobotWord(NamedTuple):
     """The parts of a text that stands for a robot."""
 
     robot: str  # a name, or the path of a file
-    link: str = ""  # that carries the ball
+    link: str = ""  # the link that carries the ball
     camera: str = ""  # the path of a file
 
     def is_likely(self) -> bool:
         """Return whether the parts look like a robot with a link and a camera, without a look at files."""
         if self.camera.lower().endswith(".urdf"):
             return False
-        return _is_robot_file(self.robot) or not (
-            self.link or "/" in self.robot or "#" in self.robot
-        )
+        if _is_robot_file(self.robot):
+            return True
+        return not (self.link or "/" in self.robot or "#" in self.robot)
 
 
 def read_word(text: str, is_there: Callable[[str], bool] = is_file) -> RobotWord:
@@ -105,21 +107,26 @@ def read_word(text: str, is_there: Callable[[str], bool] = is_file) -> RobotWord
     """
     if WITH not in text and "#" not in text:
         return RobotWord(text)
-    whole = [RobotWord(*parts) for parts in divisions(text, "#") if WITH not in parts[1]]
-    equipped = [
-        RobotWord(*parts, camera)
-        for robot, camera in divisions(text, WITH)
-        if camera
-        for parts in divisions(robot, "#")
+    without_camera = [
+        RobotWord(robot, link) for robot, link in divisions(text, "#") if WITH not in link
     ]
-    there = (
-        each for each in [*whole, *equipped] if _is_robot_file(each.robot) and is_there(each.robot)
-    )
-    likely = (each for each in [*equipped, *whole[1:]] if each.is_likely())
-    return next(there, None) or next(likely, whole[0])
+    with_camera = []
+    for before, camera in divisions(text, WITH):
+        if camera:
+            with_camera += [
+                RobotWord(robot, link, camera) for robot, link in divisions(before, "#")
+            ]
+    for word in (*without_camera, *with_camera):
+        if _is_robot_file(word.robot) and is_there(word.robot):
+            return word
+    for word in (*with_camera, *without_camera[1:]):
+        if word.is_likely():
+            return word
+    return without_camera[0]
 
 
 def _is_robot_file(name: str) -> bool:
+    """Return whether a name has the suffix of a robot's file."""
     return PurePath(name).suffix.lower() in SUFFIXES
 
 
@@ -138,12 +145,14 @@ def with_files(
 
 @cache
 def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
+    """Return a robot with the camera of a file, which was `changed` at a time [ns]."""
     del changed
     return robot.equipped(read_camera(user_path(camera)))
 
 
 @cache
 def _read(text: str, changed: int) -> Robot:
+    """Return the robot of a file, which was `changed` at a time [ns]."""
     from servobench.plant.robot import files, urdf_file  # noqa: PLC0415 - only files need their readers
 
     name, tip, _ = read_word(text)
@@ -156,8 +165,13 @@ def _read(text: str, changed: int) -> Robot:
     if kind != ".toml":
         return files.read_calibrated_robot(path)
     values = read_toml("robot file", path)
-    if "robot" not in values:
-        return files.read_dh_robot(path, values)
+    if "robot" in values:
+        return _read_twin_robot(path, values)
+    return files.read_dh_robot(path, values)
+
+
+def _read_twin_robot(path: Path, values: Mapping[str, Any]) -> Robot:
+    """Return the robot of a twin's file with its content; files that it names are beside it or where they say."""
 
     def locate(file: str) -> str:
         beside = path.parent / file
@@ -176,12 +190,14 @@ def _read(text: str, changed: int) -> Robot:
 
 RANDOM_ARM: Final = "random_arm"  # followed by a colon and the number
 MAX_NUMBER: Final = 1_000_000
-JOINTS: Final = (3, 7)  # least and largest number
-LENGTH: Final = 1.2  # [m] of all links, about that of a UR5
-SKEW: Final = math.radians(10.0)  # largest deviation of a twist from a multiple of a quarter turn
-SHARE: Final = 0.6  # probability that a length or an offset is not zero
-LIMIT: Final = 0.9 * math.pi  # [rad] of a joint to either side
-SPEED: Final = math.pi  # [rad/s] of a joint
+MIN_JOINTS: Final = 3
+MAX_JOINTS: Final = 7
+TOTAL_LENGTH: Final = 1.2  # [m] length of all links together, about that of a UR5
+MAX_SKEW: Final = math.radians(10.0)  # largest deviation of a twist from quarter turns
+LENGTH_PROBABILITY: Final = 0.6  # probability that a length or an offset is not zero
+MIN_LENGTH: Final = 0.2  # [1] least length that is not zero, over the largest one, before scaling
+JOINT_RANGE: Final = 0.9 * math.pi  # [rad] range of a joint to either side
+JOINT_SPEED: Final = math.pi  # [rad/s]
 MAX_DRAWS: Final = 200
 
 
@@ -197,26 +213,44 @@ def random_robot(number: int) -> Robot:
             f"the number of a {RANDOM_ARM} must be from 0 to {MAX_NUMBER:,}, got {number}"
         )
     generator = named_generator(number, RANDOM_ARM)
-    n, name = int(generator.integers(JOINTS[0], JOINTS[1] + 1)), f"{RANDOM_ARM}_{number}"
-    limits = JointLimits(np.full(n, -LIMIT), np.full(n, LIMIT), np.full(n, SPEED))
+    n = int(generator.integers(MIN_JOINTS, MAX_JOINTS + 1))
+    name = f"{RANDOM_ARM}_{number}"
+    limits = JointLimits(
+        lower=np.full(n, -JOINT_RANGE),
+        upper=np.full(n, JOINT_RANGE),
+        speed=np.full(n, JOINT_SPEED),
+    )
     for _ in range(MAX_DRAWS):
         arm = _draw_arm(n, generator)
-        links = estimate_links(arm, None, None)
+        links = estimate_links(arm)
         workspace = search_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
         if workspace is not None:
-            source, note = f"drawn from the number {number}", f"{name} has {n} joints"
-            return Robot(name, name, source, arm, limits, links, workspace, note=note, known=False)
+            return Robot(
+                name=name,
+                title=name,
+                source=f"drawn from the number {number}",
+                arm=arm,
+                limits=limits,
+                links=links,
+                workspace=workspace,
+                note=f"{name} has {n} joints",
+                known=False,
+            )
     raise ValueError(
         f"none of {MAX_DRAWS} arms drawn for {name} can work at the bench; take another number"
     )
 
 
 def _draw_arm(n: int, generator: np.random.Generator) -> SerialArm:
-    lengths = generator.uniform(0.2, 1.0, (2, n)) * (generator.random((2, n)) < SHARE)
-    lengths[0, 0] = max(lengths[0, 0], 0.2)  # one link at least
-    a, d = LENGTH / lengths.sum() * lengths
+    """Draw an arm with `n` joints; a DH length is zero or within a factor of five of the others."""
+    sizes = generator.uniform(MIN_LENGTH, 1.0, (2, n))
+    is_there = generator.random((2, n)) < LENGTH_PROBABILITY
+    lengths = sizes * is_there
+    lengths[0, 0] = max(lengths[0, 0], MIN_LENGTH)  # one link at least
+    a, d = TOTAL_LENGTH / lengths.sum() * lengths
     quarters = generator.choice([-1.0, 0.0, 1.0], n)
-    twists = 0.5 * math.pi * quarters + generator.uniform(-SKEW, SKEW, n)
+    skews = generator.uniform(-MAX_SKEW, MAX_SKEW, n)
+    twists = 0.5 * math.pi * quarters + skews
     names = tuple(f"joint_{i}" for i in range(1, n + 1))
     arm = with_ball(arm_from_dh(a, d, twists, names))
     return replace(arm, gear_ratio=generator.choice([-1.0, 1.0], n))

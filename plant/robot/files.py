@@ -48,12 +48,11 @@ def read_calibrated_robot(path: Path) -> Robot:
     Raises:
         ValueError: the file is missing, malformed, or fits no data sheet.
     """
-    title, deviation = known_title(read_calibration(path, np.zeros(3)), path)
+    arm = read_calibration(path, np.zeros(3))
+    title, deviation = known_title(arm, path)
     sheet = universal_robot(title)
-    source, measured = (
-        f"{path.name}, held against {sheet.source}",
-        read_calibration(path, sheet.arm.tool),
-    )
+    measured = read_calibration(path, sheet.arm.tool)
+    source = f"{path.name}, held against {sheet.source}"
     within = f"its flange within {1e3 * deviation:.1f} mm of the data sheet's"
     roles = f"the true robot is the calibrated arm, controllers know the data sheet's {title}"
     note = f"{path.name} is the factory calibration of a {title} ({within}): {roles}"
@@ -118,27 +117,30 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
     with configuration_errors(f"robot file {path}: "):
         arm = with_ball(_arm_of(table))
         n = arm.n
-        given = (
-            as_array(name, getattr(table, name), (n,))
-            for name in ("joint_lower", "joint_upper", "joint_speed")
+        limits = JointLimits(
+            lower=as_array("joint_lower", table.joint_lower, (n,)),
+            upper=as_array("joint_upper", table.joint_upper, (n,)),
+            speed=as_array("joint_speed", table.joint_speed, (n,)),
         )
-        limits = JointLimits(*given)
-        mass, torque = (
-            as_array(name, each, (n,)) if (each := getattr(table, name)) else None
-            for name in ("mass", "torque")
-        )
+        mass = as_array("mass", table.mass, (n,)) if table.mass else None
+        torque = as_array("torque", table.torque, (n,)) if table.torque else None
         links = estimate_links(arm, mass, torque)
         workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
         name = table.name or path.stem
-        estimated = "masses, inertia and torque limits are estimated from the lengths of the links"
-        note = "" if table.mass else f"{name}: {estimated}"
+        note = ""
+        if not table.mass:
+            quantities = "masses, inertia and torque limits"
+            note = f"{name}: {quantities} are estimated from the lengths of the links"
         return Robot(name, name, path.name, arm, limits, links, workspace, note=note)
 
 
 def _arm_of(table: DhTable) -> SerialArm:
+    """Return the arm of a DH table, without a ball."""
     n = len(table.joint_lower)
     names = table.joint_names or tuple(f"joint_{i}" for i in range(1, n + 1))
     if len(names) != n:
         raise ValueError(f"joint_names must hold {n} names, got {len(names)}")
     arm = arm_from_dh(table.a, table.d, table.alpha, names, modified=table.convention == "modified")
-    return replace(arm, joint_offset=as_array("theta", table.theta, (n,))) if table.theta else arm
+    if not table.theta:
+        return arm
+    return replace(arm, joint_offset=as_array("theta", table.theta, (n,)))

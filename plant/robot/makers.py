@@ -49,19 +49,22 @@ class UniversalRobot:
     d4: float
     d5: float
     d6: float
-    mass: tuple[float, ...]  # of the links [kg]
-    centre: tuple[Triple, ...]  # of mass, in DH frames [m]
-    torque: Triple  # of shoulder pan and lift, elbow, and each wrist joint [Nm]
-    speed: Triple  # of the same [deg/s]
+    mass: tuple[float, ...]  # masses of the links [kg]
+    centre: tuple[Triple, ...]  # centres of mass, in DH frames [m]
+    torque: Triple  # largest torques of shoulder pan and lift, elbow, and each wrist joint [Nm]
+    speed: Triple  # largest speeds of the same [deg/s]
     payload: float  # rated load [kg]
 
     def arm(self) -> SerialArm:
         """Return the nominal arm without a ball."""
-        a, d = (
-            (0.0, self.a2, self.a3, 0.0, 0.0, 0.0),
-            (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6),
-        )
-        return arm_from_dh(a, d, ur5.DH_ALPHA, ur5.JOINT_NAMES)
+        return _arm_of_lengths(self.a2, self.a3, self.d1, self.d4, self.d5, self.d6)
+
+
+def _arm_of_lengths(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> SerialArm:
+    """Return an arm of Universal Robots' build with given DH lengths [m], without a ball."""
+    a = (0.0, a2, a3, 0.0, 0.0, 0.0)
+    d = (d1, 0.0, 0.0, d4, d5, d6)
+    return arm_from_dh(a, d, ur5.DH_ALPHA, ur5.JOINT_NAMES)
 
 
 UNIVERSAL_ROBOTS: Final = {
@@ -74,67 +77,93 @@ def universal_robot(title: str) -> Robot:
     """Return an arm of Universal Robots by its title, such as "UR10e"."""
     row = UNIVERSAL_ROBOTS[title]
     limits = JointLimits(
-        np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(np.repeat(row.speed, ALIKE))
+        lower=np.full(6, -2 * pi),
+        upper=np.full(6, 2 * pi),
+        speed=np.radians(np.repeat(row.speed, ALIKE)),
     )
     if title == "UR5":
         return _ur5(row, limits)
     arm = with_ball(row.arm())
     scale = length_scale(arm)
-    radius, aside = scale * np.array(ur5.TUBE_RADIUS), scale * np.array(ur5.SIDE_STEP)
+    radius = scale * np.array(ur5.TUBE_RADIUS)
+    aside = scale * np.array(ur5.SIDE_STEP)
     mass = np.array(row.mass)
-    inertia, torque = cylinder_inertia(mass, radius, arm), np.repeat(row.torque, ALIKE)
-    links = Links(mass, np.array(row.centre), inertia, torque, radius, aside, row.payload)
+    links = Links(
+        mass=mass,
+        centre=np.array(row.centre),
+        inertia=cylinder_inertia(mass, radius, arm),
+        torque=np.repeat(row.torque, ALIKE),
+        radius=radius,
+        aside=aside,
+        payload=row.payload,
+    )
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
 
 
 def _ur5(row: UniversalRobot, limits: JointLimits) -> Robot:
     """Return the UR5, with the workspace of its sheet."""
-    bodies = (
-        ur5.MASS,
-        ur5.CENTRE_OF_MASS,
-        ur5.INERTIA,
-        ur5.MAX_TORQUE,
-        ur5.TUBE_RADIUS,
-        ur5.SIDE_STEP,
+    links = Links(
+        mass=np.array(ur5.MASS),
+        centre=np.array(ur5.CENTRE_OF_MASS),
+        inertia=np.array(ur5.INERTIA),
+        torque=np.array(ur5.MAX_TORQUE),
+        radius=np.array(ur5.TUBE_RADIUS),
+        aside=np.array(ur5.SIDE_STEP),
+        payload=row.payload,
     )
-    mass, middle, inertia, torque, radius, aside = map(np.array, bodies)
-    links = Links(mass, middle, inertia, torque, radius, aside, row.payload)
-    places = CENTRE, ur5.SHOULDER, ur5.HOME, ur5.TRAINING_LOWER, ur5.TRAINING_UPPER, ur5.STRETCHED
-    centre, shoulder, home, lower, upper, stretched = map(np.array, places)
-    moves = {
-        name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()
-    }
-    workspace = Workspace(1.0, centre, shoulder, home, lower, upper, moves, stretched)
+    workspace = Workspace(
+        scale=1.0,
+        centre=np.array(CENTRE),
+        shoulder=np.array(ur5.SHOULDER),
+        home=np.array(ur5.HOME),
+        lower=np.array(ur5.TRAINING_LOWER),
+        upper=np.array(ur5.TRAINING_UPPER),
+        moves={name: (np.array(start), np.array(end)) for name, (start, end) in ur5.MOVES.items()},
+        stretched=np.array(ur5.STRETCHED),
+    )
     return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
 
 
 @cache
 def panda() -> Robot:
     """Return Franka's Panda, the arm with seven joints."""
-    facts, joints = ur5.ARMS["panda"], tuple(f"joint_{i}" for i in range(1, 8))
+    facts = ur5.ARMS["panda"]
+    joints = tuple(f"joint_{i}" for i in range(1, 8))
     arm = with_ball(arm_from_dh(facts["a"], facts["d"], facts["alpha"], joints, modified=True))
-    limits = JointLimits(*(np.array(facts[name]) for name in ("lower", "upper", "speed")))
-    inertia = np.array(
-        [[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]]
+    limits = JointLimits(
+        lower=np.array(facts["lower"]),
+        upper=np.array(facts["upper"]),
+        speed=np.array(facts["speed"]),
     )
-    radius, aside = np.array(facts["radius"]), np.zeros(7)
-    bodies = at_far_end(arm, np.array(facts["centre"]), inertia)
-    links = Links(np.array(facts["mass"]), *bodies, np.array(facts["torque"]), radius, aside, 3.0)
+    tensors = [
+        [(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]
+    ]
+    centre, inertia = at_far_end(arm, np.array(facts["centre"]), np.array(tensors))
+    radius = np.array(facts["radius"])
+    aside = np.zeros(7)
+    links = Links(
+        mass=np.array(facts["mass"]),
+        centre=centre,
+        inertia=inertia,
+        torque=np.array(facts["torque"]),
+        radius=radius,
+        aside=aside,
+        payload=3.0,
+    )
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot("panda", "Panda", PANDA_SOURCE, arm, limits, links, workspace)
 
 
-MAX_DEVIATION: Final = (
-    0.02  # [m] of a calibrated length from the data sheet; real ones differ by a millimetre or two
-)
+# Largest deviation of a calibrated arm from the data sheet; real ones differ by a millimetre or two.
+MAX_DEVIATION: Final = 0.02  # [m]
 
 
 def measured_arm(robot: Robot, file: str | None) -> SerialArm:
     """Return the arm of a calibration file, with the ball of `robot`.
 
     Args:
-        robot: whose calibration it must be.
+        robot: the robot whose calibration it must be.
         file: its path; None for the one that came with the robot, or that of one real UR5 which the package brings.
 
     Raises:
@@ -150,7 +179,8 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
         raise ValueError(
             f"mismatch 'factory' without a file is {other}; use factory=FILE with its own"
         )
-    arm = read_calibration(None if file is None else user_path(file), robot.arm.tool)
+    path = None if file is None else user_path(file)
+    arm = read_calibration(path, robot.arm.tool)
     title, deviation = known_title(arm, file)
     if title != robot.title and deviation_from(arm, robot.title) > MAX_DEVIATION:
         other = f"that of a {title} (lengths within {1e3 * deviation:.1f} mm), and the robot is a {robot.title}"
@@ -176,19 +206,18 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     """
     import yaml  # noqa: PLC0415 - lists of names start without it
 
-    path = ur5.CALIBRATION if path is None else path
+    if path is None:
+        path = ur5.CALIBRATION
     keys = ("x", "y", "z", "roll", "pitch", "yaw")
     wanted = f"the blocks {', '.join(CALIBRATION_BLOCKS)}, each with {', '.join(keys)}"
     text = read_text("calibration file", path)
     try:
         blocks = yaml.safe_load(text)["kinematics"]
-        table = np.array(
-            [[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS]
-        )
+        numbers = [[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS]
+        table = np.array(numbers)
     except yaml.YAMLError as error:
-        raise ValueError(
-            f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}"
-        ) from error
+        cause = " ".join(str(error).split())
+        raise ValueError(f"calibration file {path} is not valid YAML: {cause}") from error
     except KeyError as error:
         raise ValueError(
             f"calibration file {path} lacks {error}; wanted 'kinematics' with {wanted}"
@@ -205,14 +234,16 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
         raise ValueError(f"calibration file {path} {came}: 'kinematics' has {wanted}") from error
     if not np.isfinite(table).all():
         raise ValueError(f"calibration file {path} holds a number that is not finite")
-    n, rows = len(table), np.vstack([table, np.zeros(6)])  # the flange is where the last joint is
+    n = len(table)
+    # The flange is where the last joint is.
+    rows = np.vstack([table, np.zeros(6)])
     return SerialArm(
-        ur5.JOINT_NAMES,
-        rows[:, :3],
-        rows[:, 3:],
-        np.zeros(n),
-        np.ones(n),
-        as_array("tool", tool, (3,)),
+        joint_names=ur5.JOINT_NAMES,
+        translation=rows[:, :3],
+        rpy=rows[:, 3:],
+        joint_offset=np.zeros(n),
+        gear_ratio=np.ones(n),
+        tool=as_array("tool", tool, (3,)),
     )
 
 
@@ -234,9 +265,8 @@ def known_title(arm: SerialArm, file: object) -> tuple[str, float]:
     found = f"calibration file {file} fits no arm of Universal Robots"
     lengths, apart = nearest_lengths(arm)
     if apart <= MAX_DEVIATION:
-        sizes = ", ".join(
-            f"{name} = {length:.4f}" for name, length in zip(LENGTHS, lengths.tolist(), strict=True)
-        )
+        named = zip(LENGTHS, lengths.tolist(), strict=True)
+        sizes = ", ".join(f"{name} = {length:.4f}" for name, length in named)
         looks = "looks like an arm of Universal Robots that is not in the catalogue"
         found = f"calibration file {file} {looks}: bring its URDF, or a DH table with {sizes} m"
     raise ValueError(
@@ -249,19 +279,19 @@ def nearest_lengths(arm: SerialArm) -> tuple[FloatArray, float]:
 
     The place of the flange is linear in the lengths: p(q) = Σ L_i p_i(q), p_i being that of an arm of length L_i = 1.
     """
-    places = []
-    for a2, a3, d1, d4, d5, d6 in np.eye(len(LENGTHS)).tolist():
-        unit = arm_from_dh(
-            (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), ur5.DH_ALPHA, ur5.JOINT_NAMES
-        )
-        places.append(_flanges(unit).ravel())
-    matrix, own = np.transpose(places), _flanges(arm).ravel()
-    lengths = np.linalg.lstsq(matrix, own, rcond=None)[0]
-    return np.asarray(lengths, dtype=np.float64), float(np.abs(matrix @ lengths - own).max())
+    unit_places = []
+    for unit_lengths in np.eye(len(LENGTHS)).tolist():
+        unit_arm = _arm_of_lengths(*unit_lengths)
+        unit_places.append(_flange_positions(unit_arm).ravel())
+    matrix = np.transpose(unit_places)
+    own_places = _flange_positions(arm).ravel()
+    lengths = np.linalg.lstsq(matrix, own_places, rcond=None)[0]
+    deviation = float(np.abs(matrix @ lengths - own_places).max())
+    return np.asarray(lengths, dtype=np.float64), deviation
 
 
-def _flanges(arm: SerialArm) -> FloatArray:
-    """Return the places of the flange in a few postures, (k, 3) m."""
+def _flange_positions(arm: SerialArm) -> FloatArray:
+    """Return the positions of the flange in a few postures, (k, 3) m."""
     postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, arm.n))
     return np.asarray(arm.frames(postures)[:, -1, :3, 3])
 
@@ -272,4 +302,6 @@ def deviation_from(arm: SerialArm, title: str) -> float:
     The parallel axes of shoulder lift, elbow and wrist 1 leave the split of d2, d3 and d4 open, so that calibrations
     differ in it by metres and mean the same arm, so arms are compared by the position of the flange in a few postures.
     """
-    return float(np.abs(_flanges(arm) - _flanges(UNIVERSAL_ROBOTS[title].arm())).max())
+    sheet = UNIVERSAL_ROBOTS[title].arm()
+    deviations = _flange_positions(arm) - _flange_positions(sheet)
+    return float(np.abs(deviations).max())

@@ -78,18 +78,10 @@ class Mismatch:
         for axis, magnitude in self.axes:
             if [name for name, _ in self.axes].count(axis) > 1:
                 raise ValueError(f"mismatch {str(self)!r} has the axis {axis} twice; give it once")
-            size = magnitude.size(axis)
-            if axis in SENSOR_AXES or axis in MECHANICS_AXES:
-                continue
-            units = AXES[axis][0]
-            most = 1.0 if units is SHARE else MAX_SIZE.get(next(iter(units)), math.pi)
-            if not 0.0 <= size <= most or (units is SHARE and size == most):
-                bound = replace(magnitude, number=round(most / units[magnitude.unit], 9))
-                meant = likely_meant(magnitude.number, "" if magnitude.unit else "1", most.__gt__)
-                wanted = "below" if units is SHARE else "at most"
-                raise ValueError(
-                    f"{axis} must be at least 0 and {wanted} {bound}, got {magnitude}{meant}"
-                )
+            magnitude.size(axis)  # refuses a unit that the axis does not have
+            if axis not in SENSOR_AXES and axis not in MECHANICS_AXES:
+                magnitude.check_bounds(axis)
+        # Sensor and mechanics have bounds of their own for their axes.
         _ = self.plant_settings
 
     @classmethod
@@ -102,11 +94,15 @@ class Mismatch:
         Raises:
             ValueError: an unknown word, a missing or malformed magnitude, or one out of its bounds.
         """
-        profile, calibration, axes = "", None, []
+        profile = ""
+        calibration = None
+        axes = []
         for position, word in enumerate(words_between(text, "+")):
             name, equals, value = word.partition("=")
-            if name in PROFILES and position == 0 and (name == "factory" or not equals):
-                profile, calibration = name, value if equals else None
+            is_profile = name in PROFILES and position == 0
+            if is_profile and (name == "factory" or not equals):
+                profile = name
+                calibration = value if equals else None
             elif name in AXES:
                 axes.append((name, Magnitude.parse(name, value)))
             else:
@@ -115,10 +111,13 @@ class Mismatch:
 
     def __str__(self) -> str:
         """Return the text that `parse` reads, as it stands in the column `mismatch`."""
-        profile = self.profile if self.calibration is None else f"{self.profile}={self.calibration}"
-        return "+".join(
-            [profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes]
-        )
+        words = []
+        if self.calibration is not None:
+            words.append(f"{self.profile}={self.calibration}")
+        elif self.profile:
+            words.append(self.profile)
+        words += [f"{axis}={magnitude}" for axis, magnitude in self.axes]
+        return "+".join(words)
 
     def with_axis(self, axis: str, magnitude: Magnitude) -> Mismatch:
         """Return this mismatch with one axis added.
@@ -132,17 +131,17 @@ class Mismatch:
     def size(self, axis: str) -> float:
         """Return the magnitude of an axis in SI units [rad, m or 1] or in pixels; 0 where it is not given."""
         given = dict(self.axes)
-        return (
-            given[axis].size(axis)
-            if axis in given
-            else PROFILES.get(self.profile, {}).get(axis, 0.0)
-        )
+        if axis in given:
+            return given[axis].size(axis)
+        return PROFILES.get(self.profile, {}).get(axis, 0.0)
 
     @property
     def moves_robot(self) -> bool:
         """Whether the robot or its camera differs from the nominal one at the start of a run."""
+        if self.profile == "factory":
+            return True
         own = set(AXES) - set(SENSOR_AXES) - set(MECHANICS_AXES) - {"camera_move"}
-        return self.profile == "factory" or any(self.size(axis) > 0.0 for axis in own)
+        return any(self.size(axis) > 0.0 for axis in own)
 
     @cached_property
     def plant_settings(self) -> dict[str, float | str]:
@@ -151,16 +150,18 @@ class Mismatch:
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
         """
-        sensed = [(axis, each) for axis, each in self.axes if axis in SENSOR_AXES]
-        geared = [(axis, each) for axis, each in self.axes if axis in MECHANICS_AXES]
-        axes = [
-            (axis, str(each), str(each) if each.unit in PIXELS else each.size(axis))
-            for axis, each in sensed
-        ]
-        own = {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
-        return own | {
-            f"mechanics.{MECHANICS_AXES[axis].setting}": each.size(axis) for axis, each in geared
-        }
+        sensed: list[tuple[str, str, float | str]] = []
+        geared: dict[str, float | str] = {}
+        for axis, magnitude in self.axes:
+            size = magnitude.size(axis)
+            if axis in SENSOR_AXES:
+                # Pixels keep their unit, as a setting without one is in metres.
+                value = str(magnitude) if magnitude.unit in PIXELS else size
+                sensed.append((axis, str(magnitude), value))
+            elif axis in MECHANICS_AXES:
+                geared[f"mechanics.{MECHANICS_AXES[axis].setting}"] = size
+        own = {f"sensing.{name}": value for name, value in sensor_settings(sensed).items()}
+        return own | geared
 
     @property
     def camera_exact(self) -> bool:
@@ -182,19 +183,20 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         raise ValueError(
             f"unknown mismatch axis {axis!r} (a setting is as kinematic.lag): {suggest(axis, AXES)}"
         )
-    example = RANGES[re.sub("[0-9.]", "", AXES[axis][1])]
+    unit_of_example = re.sub("[0-9.]", "", AXES[axis][1])
+    example = RANGES[unit_of_example]
     number = r"[0-9]*\.?[0-9]+"
-    match = re.fullmatch(
-        rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip()
-    )
+    range_or_list = rf"{number}(?::{number}:{number}|(?:/{number})*)"
+    match = re.fullmatch(rf"({range_or_list})\s*([a-z%]*)", text.strip())
     if match is None:
         raise ValueError(
             f"{axis} needs begin:end:step with a unit, such as {axis}={example}; got {text!r}"
         )
-    numbers = [float(part) for part in re.split("[:/]", match[1])]
-    if ":" in match[1]:
+    values, unit = match.groups()
+    numbers = [float(part) for part in re.split("[:/]", values)]
+    if ":" in values:
         numbers = _range(axis, text, *numbers)
-    magnitudes = tuple(Magnitude.parse(axis, f"{number!r}{match[2]}") for number in numbers)
+    magnitudes = tuple(Magnitude.parse(axis, f"{number!r}{unit}") for number in numbers)
     for magnitude in magnitudes:
         Mismatch("", ((axis, magnitude),))  # refuses a magnitude that is out of bounds
     return magnitudes
@@ -204,32 +206,37 @@ def parse_range(name: str, text: str) -> list[float] | list[int]:
     """Return the numbers of `begin:end:step`, both ends included; whole ones where all three are.
 
     Args:
-        name: of that which has these values, for messages.
+        name: the setting or axis that has these values, for messages.
         text: such as "0:0.2:0.05".
 
     Raises:
         ValueError: no such range, or an empty one.
     """
+    parts = text.split(":")
     try:
-        numbers = _range(name, text, *(float(part) for part in text.split(":")))
-        return (
-            [int(number) for number in numbers]
-            if all(map(str.isdigit, text.split(":")))
-            else numbers
-        )
+        # A wrong number of parts is a TypeError.
+        numbers = _range(name, text, *map(float, parts))
     except (TypeError, OverflowError) as error:
         raise ValueError(f"the range {text!r} of {name} must be begin:end:step") from error
+    if all(map(str.isdigit, parts)):
+        return [int(number) for number in numbers]
+    return numbers
 
 
 def _range(name: str, text: str, begin: float, end: float, step: float) -> list[float]:
+    """Return the numbers from begin to end in steps, rounded to nine digits."""
     where = f"the range {text!r} of {name}"
-    steps = (end - begin) / step + 1e-9 if step > 0.0 else -1.0
+    steps = -1.0
+    if step > 0.0:
+        # Rounding must not cost the last step.
+        steps = (end - begin) / step + 1e-9
     if not steps < MAX_MAGNITUDES:
         raise ValueError(f"{where} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
     if steps < 0.0:  # it begins beyond its end
         raise ValueError(f"{where} is empty")
-    values = [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
-    if steps - math.floor(steps) > 1e-6:
+    whole_steps = math.floor(steps)
+    values = [round(begin + i * step, 9) for i in range(whole_steps + 1)]
+    if steps - whole_steps > 1e-6:
         raise ValueError(
             f"{where} must be begin:end:step, but its last step ends at {values[-1]:g}"
         )
@@ -246,9 +253,7 @@ class MismatchSample:
     tool_offset: FloatArray  # (3,), m, in the flange frame
     camera_axis: FloatArray  # (3,), unit vector in the camera frame
     camera_angle: float  # rad
-    move_axis: (
-        FloatArray  # (3,), unit vector in the camera frame, of the move in the middle of the run
-    )
+    move_axis: FloatArray  # (3,), the same for the move in the middle of the run
     move_angle: float  # rad
 
     def moved(self, model: RobotModel, robot: Robot) -> RobotModel | None:
@@ -282,44 +287,55 @@ def sample_mismatch(
     Raises:
         ValueError: the calibration file is missing, malformed or that of another robot.
     """
-    nominal, n, size = robot.nominal, robot.n, mismatch.size
-
-    def draw(name: str, *shape: int) -> FloatArray:
-        return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, shape)
-
-    def factors(name: str, *shape: int) -> FloatArray:
-        """A magnitude of 0 gives factors of 1 for any draw, which saves a generator."""
-        return 1.0 + size(name) * draw(name, *shape) if size(name) > 0.0 else np.ones(shape)
-
-    angle, move = size("camera_rotation"), size("camera_move")
-    sample = MismatchSample(
-        link_scale=factors("links", n + 1, 3),
-        joint_offset=size("joint_offsets") * draw("joint_offsets", n),
-        gear_ratio=factors("gear_ratio", n),
-        tool_offset=size("tool") * draw("tool", 3),
-        camera_axis=draw_camera_axis(
-            angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")
-        ),
-        camera_angle=angle if mismatch.camera_exact else float(angle * draw("camera_angle", 1)[0]),
-        move_axis=draw_camera_axis(
-            move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")
-        ),
-        move_angle=move,
-    )
-    arm = (
-        measured_arm(robot, mismatch.calibration)
-        if mismatch.profile == "factory"
-        else robot.measured or nominal.arm
-    )
-    true = replace(
+    sample = _draw_sample(mismatch, robot.n, seed)
+    arm = robot.measured or robot.nominal.arm
+    if mismatch.profile == "factory":
+        arm = measured_arm(robot, mismatch.calibration)
+    true_arm = replace(
         arm,
         translation=arm.translation * sample.link_scale,
         joint_offset=arm.joint_offset + sample.joint_offset,
         gear_ratio=arm.gear_ratio * sample.gear_ratio,
         tool=arm.tool + sample.tool_offset,
     )
-    turn, centre = sample.camera_angle * sample.camera_axis, np.asarray(robot.workspace.centre)
-    return HandEyeModel(true, turn_about(nominal.X_BC, turn, centre)), sample
+    turn = sample.camera_angle * sample.camera_axis
+    centre = np.asarray(robot.workspace.centre)
+    X_BC = turn_about(robot.nominal.X_BC, turn, centre)
+    return HandEyeModel(true_arm, X_BC), sample
+
+
+def _draw_sample(mismatch: Mismatch, n: int, seed: int) -> MismatchSample:
+    """Draw the values of a mismatch for an arm with `n` joints; every axis has a random stream of its own."""
+    size = mismatch.size
+
+    def stream(name: str) -> np.random.Generator:
+        return named_generator(seed, f"mismatch.{name}")
+
+    def draw(name: str, *shape: int) -> FloatArray:
+        return stream(name).uniform(-1.0, 1.0, shape)
+
+    def factors(name: str, *shape: int) -> FloatArray:
+        """A magnitude of 0 gives factors of 1 for any draw, which saves a generator."""
+        magnitude = size(name)
+        if magnitude > 0.0:
+            return 1.0 + magnitude * draw(name, *shape)
+        return np.ones(shape)
+
+    most_angle = size("camera_rotation")
+    camera_angle = most_angle
+    if not mismatch.camera_exact:
+        camera_angle = float(most_angle * draw("camera_angle", 1)[0])
+    move_angle = size("camera_move")
+    return MismatchSample(
+        link_scale=factors("links", n + 1, 3),
+        joint_offset=size("joint_offsets") * draw("joint_offsets", n),
+        gear_ratio=factors("gear_ratio", n),
+        tool_offset=size("tool") * draw("tool", 3),
+        camera_axis=draw_camera_axis(most_angle, MAX_TILT, stream("camera_axis")),
+        camera_angle=camera_angle,
+        move_axis=draw_camera_axis(move_angle, MAX_MOVE_TILT, stream("move_axis")),
+        move_angle=move_angle,
+    )
 
 
 def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
@@ -327,16 +343,22 @@ def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generat
 
     A turn by φ about an axis at γ from the optical axis tilts that by τ with sin(τ/2) = sin(φ/2) sin γ.
     """
-    largest = math.sin(max_tilt / 2) / max(math.sin(angle / 2), math.sin(max_tilt / 2))
-    cos_gamma = 1.0 - generator.uniform() * (1.0 - math.sqrt(1.0 - largest**2))
+    sin_half_tilt = math.sin(max_tilt / 2)
+    max_sin_gamma = sin_half_tilt / max(math.sin(angle / 2), sin_half_tilt)
+    min_cos_gamma = math.sqrt(1.0 - max_sin_gamma**2)
+    # A uniform cosine makes directions uniform on the cap around the optical axis.
+    cos_gamma = 1.0 - generator.uniform() * (1.0 - min_cos_gamma)
     sin_gamma = math.sqrt(1.0 - cos_gamma**2)
     turn = generator.uniform(0.0, 2 * math.pi)
     sign = (-1.0, 1.0)[generator.integers(2)]
-    return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
+    x = sin_gamma * math.cos(turn)
+    y = sin_gamma * math.sin(turn)
+    return np.array([x, y, sign * cos_gamma])
 
 
 PIXELS = {"px": 1.0}
-MAX_SIZE = {"deg": math.pi, "mm": 1.0, "px": 1000.0}  # [rad, m, px] by the first unit of each kind
+# Largest magnitudes [rad, m, px] by the first unit of each kind
+MAX_SIZE = {"deg": math.pi, "mm": 1.0, "px": 1000.0}
 AXES = {
     "links": (SHARE, "10%"),
     "joint_offsets": (ANGLE, "3deg"),
@@ -411,7 +433,9 @@ class Magnitude:
             raise _not_a_magnitude(axis, text)
         magnitude = cls(float(match[1]), match[2])
         size = magnitude.size(axis)
-        if not magnitude.unit and "%" in AXES[axis][0] and USUAL_SHARE < size < 1.0:
+        units, _ = AXES[axis]
+        is_plain_share = not magnitude.unit and "%" in units
+        if is_plain_share and USUAL_SHARE < size < 1.0:
             remark(f"{axis}={text} is {size:.0%}; if {magnitude}% is meant, write the unit, too")
         return magnitude
 
@@ -421,9 +445,31 @@ class Magnitude:
         Raises:
             ValueError: the unit is none of the axis.
         """
-        if self.unit not in AXES[axis][0]:
+        units, _ = AXES[axis]
+        if self.unit not in units:
             raise _not_a_magnitude(axis, str(self))
-        return self.number * AXES[axis][0][self.unit]
+        return self.number * units[self.unit]
+
+    def check_bounds(self, axis: str) -> None:
+        """Refuse a magnitude that no deviation of a robot or a camera has.
+
+        Raises:
+            ValueError: it is negative, a share of 1 or more, or larger than the largest one of its kind.
+        """
+        size = self.size(axis)
+        units, _ = AXES[axis]
+        if units is SHARE:
+            most = 1.0
+            wanted = "below"
+            fits = 0.0 <= size < most
+        else:
+            most = MAX_SIZE.get(next(iter(units)), math.pi)
+            wanted = "at most"
+            fits = 0.0 <= size <= most
+        if not fits:
+            bound = replace(self, number=round(most / units[self.unit], 9))
+            meant = likely_meant(self.number, "" if self.unit else "1", most.__gt__)
+            raise ValueError(f"{axis} must be at least 0 and {wanted} {bound}, got {self}{meant}")
 
     def __str__(self) -> str:
         """Return the text that `parse` reads."""
@@ -431,6 +477,7 @@ class Magnitude:
 
 
 def _not_a_magnitude(axis: str, text: str) -> ValueError:
+    """Return the error about a text that is no magnitude of an axis."""
     units, example = AXES[axis]
     if re.fullmatch(r"\s*-\s*[0-9.]+\s*[a-z%]*\s*", text):
         return ValueError(

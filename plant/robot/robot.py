@@ -36,17 +36,24 @@ class Links:
     centre: FloatArray  # (n, 3) [m], centre of mass
     inertia: FloatArray  # about it [kg m²]: (n, 2), across the link and along it; or (n, 3, 3)
     torque: FloatArray  # (n,) [Nm], largest of the joint
-    radius: FloatArray  # (n,) [m] of the link's tube
-    aside: FloatArray  # (n,) [m] offset of the tube from its joints, along the joint's axis
+    radius: FloatArray  # (n,) [m], radius of the link's tube
+    aside: FloatArray  # (n,) [m], offset of the tube from its joints, along the joint's axis
     payload: float  # rated load [kg]
 
     def __post_init__(self) -> None:
         """Check the shapes and freeze the arrays."""
         n = len(self.mass)
-        shape = (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2)
-        shapes = dict.fromkeys(("mass", "torque", "radius", "aside"), (n,))
-        for name, wanted in (shapes | {"centre": (n, 3), "inertia": shape}).items():
-            object.__setattr__(self, name, as_array(name, getattr(self, name), wanted))
+        shapes: dict[str, tuple[int, ...]] = {
+            "mass": (n,),
+            "torque": (n,),
+            "radius": (n,),
+            "aside": (n,),
+            "centre": (n, 3),
+            "inertia": (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2),
+        }
+        for name, shape in shapes.items():
+            array = as_array(name, getattr(self, name), shape)
+            object.__setattr__(self, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,21 +64,18 @@ class Robot:
     title: str  # in texts, such as "UR5"
     source: str  # where the numbers come from
     arm: SerialArm  # the nominal arm with the ball on its flange
-    limits: JointLimits  # of its joints, by its maker
+    limits: JointLimits  # those of its joints, by its maker
     links: Links  # masses and shapes
     workspace: Workspace  # where it works, and where the camera hangs
-    measured: SerialArm | None = (
-        None  # the arm as its factory measured it; None where only the nominal one is known
-    )
+    # The arm as its factory measured it; None where only the nominal one is known
+    measured: SerialArm | None = None
     note: str = ""  # a line for the user about assumptions; empty for none
     flaw: str = ""  # why the physics engines cannot move it; empty for a robot that they can
-    known: bool = (
-        True  # whether controllers may know it; of another one they know joints and features alone
-    )
-    camera: OwnCamera | None = None  # of the user, in place of the bench's; None for none
-    twin: Twin | None = (
-        None  # the true robot as identified from a log, in place of mismatches; None for none
-    )
+    # Whether controllers may know it; of another one they know joints and features alone.
+    known: bool = True
+    camera: OwnCamera | None = None  # the user's, in place of the bench's; None for none
+    # The true robot as identified from a log, in place of mismatches; None for none
+    twin: Twin | None = None
 
     @property
     def n(self) -> int:
@@ -86,8 +90,9 @@ class Robot:
     @property
     def camera_pose(self) -> FloatArray:
         """The first fixed camera as planned, X_BC (4, 4)."""
-        own = None if self.camera is None else self.camera.keys.pose
-        return self.workspace.camera_pose() if own is None or own.frame != "base" else own.matrix
+        if self.camera is not None and self.camera.keys.pose.frame == "base":
+            return self.camera.keys.pose.matrix
+        return self.workspace.camera_pose()
 
     @property
     def pinhole(self) -> PinholeCamera:
@@ -96,21 +101,26 @@ class Robot:
 
     def equipped(self, camera: OwnCamera) -> Self:
         """Return the robot with a camera and a target of the user."""
-        target, work, arm, measured = camera.keys.target, self.workspace, self.arm, self.measured
+        target = camera.keys.target
+        arm = self.arm
+        measured = self.measured
         if target.frame == "flange":
             arm = replace(arm, tool=np.array(target.position))
-            measured = None if measured is None else replace(measured, tool=arm.tool)
-        robot, clear = replace(self, arm=arm, measured=measured, camera=camera), work.clear
+            if measured is not None:
+                measured = replace(measured, tool=arm.tool)
+        robot = replace(self, arm=arm, measured=measured, camera=camera)
+        clear = self.workspace.clear
         if isinstance(clear, Clearance):
             clear = replace(clear, arm=arm, X_BC=robot.camera_pose, camera=camera.pinhole)
-        return replace(robot, workspace=replace(work, ball=target.radius, clear=clear))
+        workspace = replace(self.workspace, ball=target.radius, clear=clear)
+        return replace(robot, workspace=workspace)
 
 
-DENSITY: Final = 1100.0  # [kg/m³] of the UR5's links as cylinders, in the mean
+DENSITY: Final = 1100.0  # [kg/m³] mean density of the UR5's links as cylinders
 TUBE_SHARE: Final = 0.055  # radius of the first tube over the arm's length from the shoulder on
 TAPER: Final = 0.65  # radius of the last tube over that of the first
 TORQUE_FACTOR: Final = 1.5  # torque limit over the torque that holds the stretched arm
-LEAST_TORQUE: Final = 5.0  # [Nm]
+MIN_TORQUE: Final = 5.0  # [Nm] least torque limit that is estimated
 GRAVITY: Final = 9.81  # [m/s²]
 # Centres of mass (n, 3) [m] and inertia (n, 3, 3) [kg m²] of links
 Bodies = tuple[FloatArray, FloatArray]
@@ -120,14 +130,17 @@ PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
 def cylinder_inertia(mass: FloatArray, radius: FloatArray, arm: SerialArm) -> FloatArray:
     """Return the inertia of links as solid cylinders, across and along them, (n, 2) kg m²."""
     length = norm(arm.translation[1:]) + 2.0 * radius
-    return np.stack([mass * (3.0 * radius**2 + length**2) / 12.0, mass * radius**2 / 2.0], axis=-1)
+    across = mass * (3.0 * radius**2 + length**2) / 12.0
+    along = mass * radius**2 / 2.0
+    return np.stack([across, along], axis=-1)
 
 
 def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> Bodies:
     """Return centres of mass (n, 3) m and inertia (n, 3, 3) kg m², given in joint frames, in the frames of `Links`."""
     R = rotation_from_rpy(arm.rpy[1:])
-    turned = np.swapaxes(R, -1, -2)
-    return np.vecmat(centre - arm.translation[1:], R), turned @ inertia @ R
+    turned_back = np.swapaxes(R, -1, -2)
+    moved_centre = np.vecmat(centre - arm.translation[1:], R)
+    return moved_centre, turned_back @ inertia @ R
 
 
 def estimate_links(
@@ -144,25 +157,43 @@ def estimate_links(
         torque: (n,) Nm, largest of each joint, if known.
         bodies: centres of mass (n, 3) m and inertia (n, 3, 3) kg m², as `at_far_end` returns them, if known.
     """
-    # [m] of each joint from the next one, or the flange
-    length, n = (norm(arm.translation[1:]), arm.n)
+    n = arm.n
+    # [m] from each joint to the next one, or to the flange
+    length = norm(arm.translation[1:])
     reach = float(length[1:].sum())
     radius = TUBE_SHARE * reach * np.linspace(1.0, TAPER, n)
-    mass = DENSITY * np.pi * radius**2 * (length + 2.0 * radius) if mass is None else mass
+    if mass is None:
+        mass = DENSITY * np.pi * radius**2 * (length + 2.0 * radius)
     if bodies is None:
+        # A cylinder's centre is halfway from the frame at its far end back to its joint.
         R = rotation_from_rpy(arm.rpy[1:])
-        bodies = -0.5 * np.vecmat(arm.translation[1:], R), cylinder_inertia(mass, radius, arm)
+        centre = -0.5 * np.vecmat(arm.translation[1:], R)
+        inertia = cylinder_inertia(mass, radius, arm)
+    else:
+        centre, inertia = bodies
     payload = PAYLOAD_SHARE * float(mass.sum())
-    torque = _holding_torque(length, mass, payload) if torque is None else torque
-    return Links(mass, *bodies, torque, radius, np.zeros(n), payload)
+    if torque is None:
+        torque = _torque_limits(length, mass, payload)
+    return Links(
+        mass=mass,
+        centre=centre,
+        inertia=inertia,
+        torque=torque,
+        radius=radius,
+        aside=np.zeros(n),
+        payload=payload,
+    )
 
 
-def _holding_torque(length: FloatArray, mass: FloatArray, payload: float) -> FloatArray:
+def _torque_limits(length: FloatArray, mass: FloatArray, payload: float) -> FloatArray:
     """Return the torque limits, (n,) Nm, that follow from the weight of the level, stretched arm beyond each joint."""
     ends = np.cumsum(length)
-    starts, middles = ends - length, ends - length / 2.0
-    loads = [
-        float(mass[i:] @ (middles[i:] - start)) + payload * float(ends[-1] - start)
-        for i, start in enumerate(starts)
-    ]
-    return np.maximum(TORQUE_FACTOR * (GRAVITY * np.array(loads)), LEAST_TORQUE)
+    starts = ends - length
+    middles = ends - length / 2.0
+    moments = []  # [kg m]
+    for i, start in enumerate(starts):
+        own = float(mass[i:] @ (middles[i:] - start))
+        carried = payload * float(ends[-1] - start)
+        moments.append(own + carried)
+    holding = GRAVITY * np.array(moments)
+    return np.maximum(TORQUE_FACTOR * holding, MIN_TORQUE)

@@ -23,15 +23,24 @@ JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "
 ARMS: Final[Mapping[str, Any]] = with_tuples(read_toml("facts of arms", DATA / "arms.toml"))
 """Facts by arm, with units and sources in the file."""
 _FACTS = ARMS["ur5"]
-DH_A, DH_D, DH_ALPHA = _FACTS["a"], _FACTS["d"], _FACTS["alpha"]
-MASS, CENTRE_OF_MASS, INERTIA = _FACTS["mass"], _FACTS["centre"], _FACTS["inertia"]
+DH_A = _FACTS["a"]
+DH_D = _FACTS["d"]
+DH_ALPHA = _FACTS["alpha"]
+MASS = _FACTS["mass"]
+CENTRE_OF_MASS = _FACTS["centre"]
+INERTIA = _FACTS["inertia"]
 MAX_TORQUE = _FACTS["torque"]
-TUBE_RADIUS, SIDE_STEP = _FACTS["tube_radius"], _FACTS["side_step"]
+TUBE_RADIUS = _FACTS["tube_radius"]
+SIDE_STEP = _FACTS["side_step"]
 
-TOOL, SHOULDER, MOVES = _FACTS["tool"], _FACTS["shoulder"], _FACTS["moves"]
-HOME, STRETCHED = _FACTS["home"], _FACTS["stretched"]
-CALIBRATION: Final = DATA / "ur5_factory_calibration.yaml"  # of one real UR5
-TRAINING_LOWER, TRAINING_UPPER = _FACTS["training_lower"], _FACTS["training_upper"]
+TOOL = _FACTS["tool"]
+SHOULDER = _FACTS["shoulder"]
+MOVES = _FACTS["moves"]
+HOME = _FACTS["home"]
+STRETCHED = _FACTS["stretched"]
+CALIBRATION: Final = DATA / "ur5_factory_calibration.yaml"  # the file of one real UR5
+TRAINING_LOWER = _FACTS["training_lower"]
+TRAINING_UPPER = _FACTS["training_upper"]
 
 
 def ur5_arm() -> SerialArm:
