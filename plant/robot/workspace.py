@@ -12,7 +12,7 @@ along its axis to the tube's side, along the tube, and to the next joint, as the
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +48,7 @@ class Workspace:
     upper: FloatArray  # (n,) [rad]
     moves: Mapping[str, Pair]  # start and target [rad] of the moves by name
     stretched: FloatArray  # (n,) [rad], a start at which the Jacobian is nearly singular
-    # returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None where
+    # It returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None where
     # all of the box is.
     clear: Clear | None = None
     ball: float | None = None  # radius of a ball of the user's [m]; None for that of the bench
@@ -59,14 +59,17 @@ class Workspace:
         shapes = {
             "centre": 3,
             "shoulder": 3,
-            **dict.fromkeys(("home", "lower", "upper", "stretched"), n),
+            "home": n,
+            "lower": n,
+            "upper": n,
+            "stretched": n,
         }
         for name, size in shapes.items():
-            object.__setattr__(self, name, as_array(name, getattr(self, name), (size,)))
-        moves = {
-            name: tuple(as_array(name, end, (n,)) for end in ends)
-            for name, ends in self.moves.items()
-        }
+            array = as_array(name, getattr(self, name), (size,))
+            object.__setattr__(self, name, array)
+        moves = {}
+        for name, (start, target) in self.moves.items():
+            moves[name] = (as_array(name, start, (n,)), as_array(name, target, (n,)))
         object.__setattr__(self, "moves", moves)
 
     @property
@@ -77,12 +80,15 @@ class Workspace:
     @property
     def ball_radius(self) -> float:
         """Radius of the ball, which has the same size in the image of every arm [m]."""
-        return BALL_RADIUS * self.scale if self.ball is None else self.ball
+        if self.ball is not None:
+            return self.ball
+        return BALL_RADIUS * self.scale
 
     @property
     def reach(self) -> tuple[float, float]:
         """Least and largest easily reached distance of the ball from the shoulder [m]."""
-        return REACH[0] * self.scale, REACH[1] * self.scale
+        least, largest = REACH
+        return least * self.scale, largest * self.scale
 
     def camera_pose(self) -> FloatArray:
         """Return X_BC, (4, 4), of the camera as planned, which looks straight down at the centre."""
@@ -97,16 +103,24 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
     return pose
 
 
-Found = tuple[float, Callable[[], Workspace]]
-HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius; of a UR5
-BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
-OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
-BUILT_IN: Final = 0.4  # share of random postures with overlap above which two tubes count as built into each other
-IMAGE_SHARE: Final = (
-    0.8  # share of the image's half sides for the ball, with a margin for a turned camera
+# The lengths of the criteria are those of a UR5.
+MIN_LINK_HEIGHT: Final = (
+    0.03  # [m] least height of a link above the table, in addition to its radius
 )
-MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian; of a UR5
-STOP_MARGIN: Final = 0.25  # [rad] from a joint's stop
+MIN_BALL_HEIGHT: Final = 0.08  # [m] least height of the ball's centre above the table
+MAX_OVERLAP: Final = 0.02  # [m] overlap that is no contact yet, as the tubes are schematic
+# Two tubes that overlap in more than this share of random postures count as built into each other.
+BUILT_IN_SHARE: Final = 0.4  # [1]
+# Share of the image's half sides in which the ball is, with a margin for a turned camera
+IMAGE_SHARE: Final = 0.8  # [1]
+MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian
+STOP_MARGIN: Final = 0.25  # [rad] least distance from a joint's stop
+# Radii of an arm's tubes over that of their link: of the piece beside the joint, and of the long one
+ASIDE_RADIUS: Final = 0.8  # [1]
+LINK_RADIUS: Final = 0.95  # [1]
+MIN_TUBE_LENGTH: Final = (
+    1e-3  # [m] least length of a tube between a joint's side and the next joint
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +139,23 @@ class Tubes:
 
 def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
     """Return the tubes of links with a `radius`, (n,) m, at an offset `aside`, (n,) m, from their joints."""
-    link, ends, radii = [], [], []
+    links = []
+    ends = []
+    radii = []
+
+    def add(i: int, begin: FloatArray, end: FloatArray, share: float) -> None:
+        links.append(i)
+        ends.append((begin, end))
+        radii.append(share * radius[i])
+
     for i in range(arm.n):
-        step = arm.translation[i + 1]
-        top, corner = np.array([0.0, 0.0, aside[i]]), np.array([step[0], step[1], aside[i]])
-        for begin, end, share in ((top, corner, 0.8), (corner, step, 0.95)):
-            if np.linalg.norm(end - begin) > 1e-3 or begin is top:
-                link.append(i)
-                ends.append((begin, end))
-                radii.append(share * radius[i])
-    return Tubes(np.array(link), np.array(ends), np.array(radii))
+        next_joint = arm.translation[i + 1]
+        side = np.array([0.0, 0.0, aside[i]])
+        corner = np.array([next_joint[0], next_joint[1], aside[i]])
+        add(i, side, corner, ASIDE_RADIUS)
+        if np.linalg.norm(next_joint - corner) > MIN_TUBE_LENGTH:
+            add(i, corner, next_joint, LINK_RADIUS)
+    return Tubes(np.array(links), np.array(ends), np.array(radii))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +163,11 @@ class Clearance:
     """Decides whether postures are fit to work in; `scale` is that of the workspace."""
 
     arm: SerialArm  # the nominal arm
-    tubes: Tubes  # of its links
+    tubes: Tubes  # the tubes of its links
     lower: FloatArray  # (n,) [rad], its stops
     upper: FloatArray  # (n,) [rad]
     X_BC: FloatArray  # (4, 4), the camera
-    scale: float  # of all lengths over those of a UR5's bench
+    scale: float  # all lengths over those of a UR5's bench
     ball_radius: float  # [m]
     # (p, 2), tubes that must not meet
     pairs: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
@@ -160,14 +181,18 @@ class Clearance:
             singular: allow a Jacobian that is nearly singular.
         """
         q = np.asarray(joint_position, dtype=np.float64)
-        fits = np.asarray(
-            ((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1)
-        )
+        off_lower = q >= self.lower + STOP_MARGIN
+        off_upper = q <= self.upper - STOP_MARGIN
+        fits = np.asarray((off_lower & off_upper).all(axis=-1))
         frames = self.arm.frames(q[fits])
-        ball, placed = self.arm.ball(frames), self.tubes.placed(frames)
-        good = (ball[:, 2] >= BALL_HEIGHT * self.scale) & self._above_table(placed)
-        good[good] = self._in_view(ball[good], placed[good])
-        good[good] = (self.gaps(placed[good], self.pairs) >= -OVERLAP * self.scale).all(axis=-1)
+        ball = self.arm.ball(frames)
+        tubes = self.tubes.placed(frames)
+        ball_is_high = ball[:, 2] >= MIN_BALL_HEIGHT * self.scale
+        good = ball_is_high & self._above_table(tubes)
+        # Each of the dearer criteria is asked only of the postures that are good by then.
+        good[good] = self._in_view(ball[good], tubes[good])
+        gaps = self.gaps(tubes[good], self.pairs)
+        good[good] = (gaps >= -MAX_OVERLAP * self.scale).all(axis=-1)
         if not singular:
             good[good] = self.gain(frames[good]) >= MIN_GAIN * self.scale
         fits[fits] = good
@@ -175,31 +200,38 @@ class Clearance:
 
     def gain(self, frames: FloatArray) -> FloatArray:
         """Return the least singular value of the position Jacobian, (...) m/rad, for frames (..., n+1, 4, 4)."""
-        motions = self.arm.motions(frames, self.arm.ball(frames)[..., None, :])[..., 0, :, :]
-        return np.asarray(np.linalg.svd(motions.mT, compute_uv=False)[..., -1])
+        ball = self.arm.ball(frames)[..., None, :]
+        motions = self.arm.motions(frames, ball)[..., 0, :, :]
+        singular_values = np.linalg.svd(motions.mT, compute_uv=False)
+        return np.asarray(singular_values[..., -1])
 
     def gaps(self, placed: FloatArray, pairs: npt.NDArray[np.intp]) -> FloatArray:
         """Return the free distance of pairs of tubes, (..., p) m; negative where they overlap."""
-        first, second = placed[..., pairs[:, 0], :, :], placed[..., pairs[:, 1], :, :]
-        return np.asarray(segment_distance(first, second) - self.tubes.radius[pairs].sum(axis=-1))
+        first = placed[..., pairs[:, 0], :, :]
+        second = placed[..., pairs[:, 1], :, :]
+        radii = self.tubes.radius[pairs].sum(axis=-1)
+        return np.asarray(segment_distance(first, second) - radii)
 
     def _above_table(self, placed: FloatArray) -> BoolArray:
         """Return whether all links but the first two, which stand on the table, are above it."""
         chosen = self.tubes.link >= 1
-        low = placed[..., 2][..., chosen, :].min(axis=-1) - self.tubes.radius[chosen]
-        return np.asarray((low >= HEIGHT * self.scale).all(axis=-1))
+        heights = placed[..., 2][..., chosen, :]
+        lowest = heights.min(axis=-1) - self.tubes.radius[chosen]
+        return np.asarray((lowest >= MIN_LINK_HEIGHT * self.scale).all(axis=-1))
 
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
-        p_C = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
-        half = (
-            IMAGE_SHARE
-            * np.array([self.camera.width, self.camera.height])
-            / (2.0 * self.camera.focal)
-        )
-        inside = (np.abs(p_C[..., :2]) <= half * p_C[..., 2:]).all(axis=-1) & (p_C[..., 2] > 0.0)
-        line = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
-        free = segment_distance(placed, line[..., None, :, :]) - self.tubes.radius
+        R_BC = self.X_BC[:3, :3]
+        p_BC = self.X_BC[:3, 3]
+        p_C = np.vecmat(ball - p_BC, R_BC)
+        size = np.array([self.camera.width, self.camera.height])
+        # Half sides of the image over the distance from the camera
+        half = IMAGE_SHARE * size / (2.0 * self.camera.focal)
+        across = np.abs(p_C[..., :2])
+        depth = p_C[..., 2]
+        inside = (across <= half * p_C[..., 2:]).all(axis=-1) & (depth > 0.0)
+        ray = np.stack([ball, np.broadcast_to(p_BC, ball.shape)], axis=-2)
+        free = segment_distance(placed, ray[..., None, :, :]) - self.tubes.radius
         return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
 
 
@@ -207,37 +239,52 @@ def collision_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[n
     """Return the pairs of tubes, (p, 2), that can collide: not of neighbours, and separate in most of (k, n) rad."""
     link = clearance.tubes.link
     i, j = np.triu_indices(len(link), 1)
-    pairs = np.stack([i, j], axis=-1)[link[j] - link[i] > 1]
+    are_apart = link[j] - link[i] > 1
+    pairs = np.stack([i, j], axis=-1)[are_apart]
     placed = clearance.tubes.placed(clearance.arm.frames(postures))
-    built_in = (clearance.gaps(placed, pairs) < 0.0).mean(axis=0) > BUILT_IN
+    overlap_share = (clearance.gaps(placed, pairs) < 0.0).mean(axis=0)
+    built_in = overlap_share > BUILT_IN_SHARE
     return np.asarray(pairs[~built_in])
 
 
 def segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the distance between segments with ends (..., 2, 3) m, (...) m; Ericson, Real-Time Collision Detection."""
-    p, d1 = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
-    r0, d2 = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
-    r = p - r0
-    a, e, b = (np.vecdot(x, y) for x, y in ((d1, d1), (d2, d2), (d1, d2)))
-    c, f = np.vecdot(d1, r), np.vecdot(d2, r)
+    """Return the distance between segments with ends (..., 2, 3) m, (...) m; Ericson, Real-Time Collision Detection.
+
+    The nearest points are p₁ + s d₁ and p₂ + t d₂, 0 ≤ s, t ≤ 1. For lines, with r = p₁ − p₂,
+
+        s = (b f − c e) / (a e − b²),   t = (b s + f) / e,   a = d₁ᵀd₁, b = d₁ᵀd₂, c = d₁ᵀr, e = d₂ᵀd₂, f = d₂ᵀr
+
+    and s = (b t − c) / a where t is clipped.
+    """
+    p1 = first[..., 0, :]
+    p2 = second[..., 0, :]
+    d1 = first[..., 1, :] - p1
+    d2 = second[..., 1, :] - p2
+    r = p1 - p2
+    a = np.vecdot(d1, d1)
+    e = np.vecdot(d2, d2)
+    b = np.vecdot(d1, d2)
+    c = np.vecdot(d1, r)
+    f = np.vecdot(d2, r)
     tiny = 1e-12
+    # It is 0 for parallel lines, for which any s will do.
     denominator = a * e - b * b
-    s = np.where(
-        denominator > tiny, np.clip((b * f - c * e) / np.maximum(denominator, tiny), 0.0, 1.0), 0.0
-    )
-    t = np.where(e > tiny, (b * s + f) / np.maximum(e, tiny), 0.0)
-    clipped = np.clip(t, 0.0, 1.0)
-    again = np.where(a > tiny, np.clip((b * clipped - c) / np.maximum(a, tiny), 0.0, 1.0), 0.0)
-    s = np.where((clipped != t) | (e <= tiny), again, s)
-    return norm(p + s[..., None] * d1 - r0 - clipped[..., None] * d2)
+    on_lines = np.clip((b * f - c * e) / np.maximum(denominator, tiny), 0.0, 1.0)
+    s = np.where(denominator > tiny, on_lines, 0.0)
+    unclipped = np.where(e > tiny, (b * s + f) / np.maximum(e, tiny), 0.0)
+    t = np.clip(unclipped, 0.0, 1.0)
+    for_clipped = np.clip((b * t - c) / np.maximum(a, tiny), 0.0, 1.0)
+    for_clipped = np.where(a > tiny, for_clipped, 0.0)
+    s = np.where((t != unclipped) | (e <= tiny), for_clipped, s)
+    return norm(p1 + s[..., None] * d1 - p2 - t[..., None] * d2)
 
 
 LENGTH_OF_UR5: Final = 1.10335  # [m] from its shoulder along the links to the flange
-TOOL: Final = 0.10  # [m] from the flange to the ball; of a UR5
-HOME_POINT: Final = (0.5, 0.0, 0.3)  # [m] the ball at home; of a UR5
-STRETCHED_POINT: Final = (3.0, 0.0, 0.1)  # [m] out of reach: the arm points there; of a UR5
-# [m] by which the workspace is lifted until enough postures are fit; of a UR5
-HEIGHTS: Final = (0.0, 0.1, 0.2)
+TOOL: Final = 0.10  # [m] from the flange to the ball, for a UR5
+HOME_POINT: Final = (0.5, 0.0, 0.3)  # [m] the ball at home, for a UR5
+STRETCHED_POINT: Final = (3.0, 0.0, 0.1)  # [m] out of reach: the arm points there; for a UR5
+# The workspace is lifted by these heights until enough postures are fit; for a UR5.
+HEIGHTS: Final = (0.0, 0.1, 0.2)  # [m]
 # The ball in the base frame of a UR5 at start and target of each move [m].
 MOVES: Final = {
     "exp1": ((0.50, -0.10, 0.35), (0.15, 0.58, 0.30)),
@@ -248,25 +295,30 @@ MOVES: Final = {
 
 STARTS: Final = 512  # starts of the search for a home
 CANDIDATES: Final = 12  # homes whose surroundings are sampled
-WINDING: Final = (
-    0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
-)
+# A home is the worse, the further its joints are from zero; for a UR5.
+WINDING_COST: Final = 0.03  # [m/rad²]
 NEIGHBOURS: Final = 192  # sampled postures in a box
 NEAR_STARTS: Final = 96  # starts of the search for a posture near the home
-NEAR: Final = 0.4  # [rad] deviation of those starts from the home
+NEAR_DEVIATION: Final = 0.4  # [rad] standard deviation of those starts from the home
 HALF_BOX: Final = 0.6  # [rad] half sides of the box
 LAST_HALF: Final = 0.3  # [rad] half side for the last joint, which moves the ball little
 # Factors on the box until enough postures in it are fit
 SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)
-ENOUGH: Final = 0.7  # share of fit postures in a box
-WAYS: Final = 24  # number of starts that are tried for a move
-WAY_STEPS: Final = 40  # steps on the path of a move
+ENOUGH: Final = 0.7  # share of fit postures in a box that ends the search for a smaller one
+GOOD_BOX: Final = ENOUGH * 0.8  # fit share times size of a box that ends the search for a height
+MOVE_STARTS: Final = 24  # number of starts that are tried for a move
+PATH_STEPS: Final = 40  # steps on the path of a move
 WITHDRAWALS: Final = 8  # steps of a tenth towards the home if no fit posture reaches a position
+PINV_CUTOFF: Final = (
+    0.02  # [1] singular values on a path below this share of the largest count as 0
+)
+STOP_DISTANCE: Final = 0.1  # [rad] distance of a stretched posture from the joints' stops
 
 
 def length_scale(arm: SerialArm) -> float:
     """Return the length of an arm from its shoulder to its flange, over that of a UR5."""
-    return float(norm(arm.translation[2:]).sum()) / LENGTH_OF_UR5
+    lengths = norm(arm.translation[2:])
+    return float(lengths.sum()) / LENGTH_OF_UR5
 
 
 def with_ball(arm: SerialArm) -> SerialArm:
@@ -280,32 +332,33 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
     Raises:
         ValueError: no posture is fit to work in: the arm cannot reach the middle of its bench.
     """
-    if (found := search_workspace(arm, limits, shapes)) is not None:
+    found = search_workspace(arm, limits, shapes)
+    if found is not None:
         return found
     if arm.n < 3 or length_scale(arm) == 0.0:
         size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
         raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
-    look = (
-        "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
-    )
-    shift = arm.translation[0]
-    heights = (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4)))
-    moved = [
-        np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights if shift.any()
-    ]
-    if (
-        _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1])
-        is not None
-    ):
-        look = "its joint limits, which forbid all of them"
-    elif any(
-        _at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None
-        for each in moved
-    ):
-        place = ", ".join(f"{each:g}" for each in shift)
-        look = f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
+    look = _likely_cause(arm, limits, shapes)
     wanted = "in which its ball is over the table, in view of the camera and free of contact"
     raise ValueError(f"the arm has no posture {wanted}; look at {look}")
+
+
+def _likely_cause(arm: SerialArm, limits: Pair, shapes: Pair) -> str:
+    """Return what in the description of an arm without a fit posture is likely wrong."""
+    whole_turn = (np.full(arm.n, -np.pi), np.full(arm.n, np.pi))
+    if _at_height(arm, whole_turn, shapes, HEIGHTS[-1]) is not None:
+        return "its joint limits, which forbid all of them"
+    shift = arm.translation[0]
+    if shift.any():
+        for height in (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4))):
+            translation = np.vstack([(0.0, 0.0, height), arm.translation[1:]])
+            moved = replace(arm, translation=translation)
+            if _at_height(moved, limits, shapes, HEIGHTS[0]) is not None:
+                place = ", ".join(f"{each:g}" for each in shift)
+                return f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
+    return (
+        "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
+    )
 
 
 def search_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace | None:
@@ -316,72 +369,121 @@ def search_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace | 
         limits: lower and upper joint positions, (n,) and (n,) rad.
         shapes: radius of each link's tube and how far it lies aside, (n,) and (n,) m.
     """
-    best = None
-    for height in HEIGHTS if arm.n >= 3 and length_scale(arm) > 0.0 else ():
+    if arm.n < 3 or length_scale(arm) <= 0.0:
+        return None
+    best: Found | None = None
+    for height in HEIGHTS:
         found = _at_height(arm, limits, shapes, height)
-        best = max(filter(None, (best, found)), key=lambda each: each[0], default=None)
-        if found is not None and found[0] >= ENOUGH * 0.8:
+        if found is None:
+            continue
+        if best is None or found.score > best.score:
+            best = found
+        if found.score >= GOOD_BOX:
             break
-    return best and best[1]()
+    if best is None:
+        return None
+    return best.make()
+
+
+class Found(NamedTuple):
+    """A workspace that was found at a height."""
+
+    score: float  # fit share of the box around the home, times the factor on its size
+    make: Callable[[], Workspace]  # its moves take longer to find than all the rest
 
 
 def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> Found | None:
-    """Return the fit share of the box at a height and the parts of its workspace; None where no home is found."""
+    """Return the workspace of an arm at a height; None where no home is found."""
     scale = length_scale(arm)
     lift = np.array([0.0, 0.0, height])
     centre = scale * (np.array(CENTRE) + lift)
     pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
     lower, upper = limits
-    clear = Clearance(arm, link_tubes(arm, *shapes), lower, upper, pose, scale, BALL_RADIUS * scale)
+    clear = Clearance(
+        arm=arm,
+        tubes=link_tubes(arm, *shapes),
+        lower=lower,
+        upper=upper,
+        X_BC=pose,
+        scale=scale,
+        ball_radius=BALL_RADIUS * scale,
+    )
     rng = np.random.default_rng(0)
-    postures = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (STARTS, arm.n))
+    within_turn = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
+    postures = rng.uniform(*within_turn, (STARTS, arm.n))
     clear = replace(clear, pairs=collision_pairs(clear, postures))
     home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
     if home is None:
         return None
-    share, box = _find_box(clear, home)
+    box = _find_box(clear, home)
 
-    def workspace() -> Workspace:
-        moves = {
-            name: _move(clear, home, *(scale * (np.array(ends) + lift)))
-            for name, ends in MOVES.items()
-        }
-        stretched = _stretch(clear, home, scale * np.array(STRETCHED_POINT), postures)
-        shoulder = arm.frames(np.zeros(arm.n))[1, :3, 3]
-        return Workspace(scale, centre, shoulder, home, *box, moves, stretched, clear)
+    def make() -> Workspace:
+        moves = {}
+        for name, ends in MOVES.items():
+            start, target = scale * (np.array(ends) + lift)
+            moves[name] = _move(clear, home, start, target)
+        return Workspace(
+            scale=scale,
+            centre=centre,
+            shoulder=arm.frames(np.zeros(arm.n))[1, :3, 3],
+            home=home,
+            lower=box.lower,
+            upper=box.upper,
+            moves=moves,
+            stretched=_stretch(clear, home, scale * np.array(STRETCHED_POINT), postures),
+            clear=clear,
+        )
 
-    return share, workspace
+    return Found(box.score, make)
 
 
 def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> FloatArray | None:
     """Return the fit posture with the ball at `point` (3,) m that has the most fit postures around it."""
     q, distance = reach_for(clear.arm, point, postures, clear.lower, clear.upper)
     turned = (q + np.pi) % (2 * np.pi) - np.pi
-    # Within ±π where the stops allow it
-    q = np.where((turned >= clear.lower) & (turned <= clear.upper), turned, q)
+    # Joints turn within ±π where the stops allow it.
+    is_allowed = (turned >= clear.lower) & (turned <= clear.upper)
+    q = np.where(is_allowed, turned, q)
     fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
     if not len(fit):
         return None
-    cost = WINDING * norm(fit) - clear.gain(clear.arm.frames(fit)) / clear.scale
+    gain = clear.gain(clear.arm.frames(fit)) / clear.scale
+    cost = WINDING_COST * norm(fit) - gain
     homes = fit[np.argsort(cost, kind="stable")[:CANDIDATES]]
-    return np.asarray(max(homes, key=lambda home: _find_box(clear, home)[0]))
+    return np.asarray(max(homes, key=lambda home: _find_box(clear, home).score))
 
 
-def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, Pair]:
-    """Return the largest box around a home with enough fit postures, and their share."""
+class Box(NamedTuple):
+    """A box of joint positions around a home."""
+
+    score: float  # share of fit postures in it, times the factor on its size
+    lower: FloatArray  # (n,) [rad]
+    upper: FloatArray  # (n,) [rad]
+
+
+def _find_box(clear: Clearance, home: FloatArray) -> Box:
+    """Return the largest box around a home with enough fit postures."""
     half = np.append(np.full(clear.arm.n - 1, HALF_BOX), LAST_HALF)
     unit = np.random.default_rng(1).uniform(-1.0, 1.0, (NEIGHBOURS, clear.arm.n))
-    best = 0.0, (home - SHRINK[-1] * half, home + SHRINK[-1] * half)
+    least_half = SHRINK[-1] * half
+    best = Box(0.0, home - least_half, home + least_half)
     for shrink in SHRINK:
-        corners = (
-            np.maximum(home - shrink * half, clear.lower),
-            np.minimum(home + shrink * half, clear.upper),
-        )
-        share = float(clear(np.clip(home + shrink * half * unit, *corners)).mean())
+        lower = np.maximum(home - shrink * half, clear.lower)
+        upper = np.minimum(home + shrink * half, clear.upper)
+        postures = np.clip(home + shrink * half * unit, lower, upper)
+        share = float(clear(postures).mean())
+        box = Box(shrink * share, lower, upper)
         if share >= ENOUGH:
-            return shrink * share, corners
-        best = max(best, (shrink * share, corners), key=lambda each: each[0])
+            return box
+        if box.score > best.score:
+            best = box
     return best
+
+
+def _near_home(clear: Clearance, home: FloatArray, seed: int) -> FloatArray:
+    """Return postures that are drawn around a home, (s, n) rad."""
+    unit = np.random.default_rng(seed).standard_normal((NEAR_STARTS, clear.arm.n))
+    return np.asarray(home + NEAR_DEVIATION * unit)
 
 
 def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatArray) -> Pair:
@@ -390,40 +492,47 @@ def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatAr
     The way is that of a servo that knows the arm: the ball goes straight, the joints by the pseudo-inverse. A move
     for which none of the postures at its start is fit is drawn together towards the home.
     """
-    starts = home + NEAR * np.random.default_rng(2).standard_normal((NEAR_STARTS, clear.arm.n))
-    starts = np.clip(np.vstack([home, starts]), clear.lower, clear.upper)
-    middle = clear.arm.ball_position(home)
+    starts = np.vstack([home, _near_home(clear, home, seed=2)])
+    starts = np.clip(starts, clear.lower, clear.upper)
+    home_ball = clear.arm.ball_position(home)
     for step in range(WITHDRAWALS):
-        ends = [point + 0.1 * step * (middle - point) for point in (start, target)]
-        q, distance = reach_for(clear.arm, ends[0], starts, clear.lower, clear.upper)
+        drawn_start = start + 0.1 * step * (home_ball - start)
+        drawn_target = target + 0.1 * step * (home_ball - target)
+        q, distance = reach_for(clear.arm, drawn_start, starts, clear.lower, clear.upper)
         fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
-        fit = fit[np.argsort(norm(fit - home), kind="stable")[:WAYS]]
-        ways = _straight_ways(clear, fit, ends[1])
-        good = clear(ways, singular=True).all(axis=0) & clear(ways[-1])
+        nearest = np.argsort(norm(fit - home), kind="stable")[:MOVE_STARTS]
+        paths = _straight_paths(clear, fit[nearest], drawn_target)
+        good = clear(paths, singular=True).all(axis=0) & clear(paths[-1])
         if good.any():
-            way = ways[:, int(np.argmax(good))]
-            return way[0], way[-1]
+            path = paths[:, int(np.argmax(good))]
+            return path[0], path[-1]
     return home, home
 
 
-def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> FloatArray:
+def _straight_paths(clear: Clearance, starts: FloatArray, target: FloatArray) -> FloatArray:
     """Return the postures, (k+1, s, n) rad, on straight paths of the ball from (s, n) rad to a target (3,) m."""
-    q, ways = starts, [starts]
-    for left in range(WAY_STEPS, 0, -1):
+    q = starts
+    postures = [starts]
+    for steps_left in range(PATH_STEPS, 0, -1):
         ball, J = clear.arm.ball_and_jacobian(q)
-        q = q + np.matvec(np.linalg.pinv(J, rcond=0.02), (target - ball) / left)
-        ways.append(q)
-    return np.array(ways)
+        inverse = np.linalg.pinv(J, rcond=PINV_CUTOFF)
+        q = q + np.matvec(inverse, (target - ball) / steps_left)
+        postures.append(q)
+    return np.array(postures)
 
 
 def _stretch(
     clear: Clearance, home: FloatArray, point: FloatArray, postures: FloatArray
 ) -> FloatArray:
     """Return the otherwise fit posture with the least gain, of those that point at a position out of reach."""
-    near = home + NEAR * np.random.default_rng(3).standard_normal((NEAR_STARTS, clear.arm.n))
-    starts = np.clip(np.vstack([near, postures[: 2 * NEAR_STARTS]]), clear.lower, clear.upper)
-    q, _ = reach_for(clear.arm, point, starts, clear.lower + 0.1, clear.upper - 0.1)
+    near = _near_home(clear, home, seed=3)
+    starts = np.vstack([near, postures[: 2 * NEAR_STARTS]])
+    starts = np.clip(starts, clear.lower, clear.upper)
+    lower = clear.lower + STOP_DISTANCE
+    upper = clear.upper - STOP_DISTANCE
+    q, _ = reach_for(clear.arm, point, starts, lower, upper)
     fit = q[clear(q, singular=True)]
     if not len(fit):
         fit = np.vstack([home, postures[clear(postures, singular=True)]])
-    return np.asarray(fit[np.argmin(clear.gain(clear.arm.frames(fit)))])
+    gain = clear.gain(clear.arm.frames(fit))
+    return np.asarray(fit[np.argmin(gain)])
