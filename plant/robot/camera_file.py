@@ -62,19 +62,16 @@ RANGES: Final = {  # of numbers: unit, least and largest
 FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of the image
 MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
 MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
-MAX_MOVED: Final = (
-    0.5  # share of its distance from the middle by which a distortion usually moves a point
-)
+# Share of its distance from the middle by which a distortion usually moves a point at most
+MAX_MOVED: Final = 0.5  # [1]
 ENDLESS: Final = 1e6  # [1] r² of a ray that no image shows
 MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] from the optical axis to it
 ROUNDED_ROOT: Final = 1e-9  # [1] by which the root of a polynomial is off at most
-MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
-IN_STEP: Final = (
-    2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
-)
-MAX_ROUNDED: Final = (
-    0.015  # [1] by which a frame of whole milliseconds may differ from the camera's
-)
+MIN_AHEAD: Final = 0.5  # usual least cosine of the angle between the z axes of camera and flange
+# Largest deviation of whole control periods from a frame that is in step with them
+IN_STEP: Final = 2e-4  # [1]
+# Largest difference of a frame of whole milliseconds from the camera's
+MAX_ROUNDED: Final = 0.015  # [1]
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
 Row = tuple[Number, ...]
 
@@ -91,7 +88,8 @@ class Place:
     def __post_init__(self) -> None:
         """Check the numbers."""
         most = MAX_PLACE.get(self.frame, math.inf)
-        if bool(self.frame) != bool(self.position) or len(self.position) not in (0, 3):
+        is_half_given = bool(self.frame) != bool(self.position)
+        if is_half_given or len(self.position) not in (0, 3):
             raise ValueError(
                 'a place needs frame, "base" or "flange", and position, three numbers in m'
             )
@@ -124,23 +122,33 @@ class Pose(Place):
         """The pose in its frame, (4, 4)."""
         from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
-        given = (
-            np.array(self.rotation)
-            if len({np.size(row) for row in self.rotation}) == 1
-            else np.zeros(0)
-        )
-        if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
+        given = np.zeros(0)
+        if len({np.size(row) for row in self.rotation}) == 1:
+            given = np.array(self.rotation)
+        if _is_quaternion(given):
             rotation = Rotation.from_quat(given)
-        elif given.shape == (3, 3) and np.abs(
-            given @ given.T - np.eye(3)
-        ).max() < ROUNDED < np.linalg.det(given):
+        elif _is_rotation_matrix(given):
             rotation = Rotation.from_matrix(given)
         else:
             wanted = "a rotation matrix or a quaternion of length 1"
             raise ValueError(f"pose.rotation must be {wanted}, got {self.rotation}")
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), self.position or 0.0
+        pose[:3, :3] = rotation.as_matrix()
+        pose[:3, 3] = self.position or 0.0
         return pose
+
+
+def _is_quaternion(given: FloatArray) -> bool:
+    """Return whether an array is a quaternion of length 1, whose numbers may be rounded."""
+    return given.shape == (4,) and bool(abs(np.linalg.norm(given) - 1.0) < ROUNDED)
+
+
+def _is_rotation_matrix(given: FloatArray) -> bool:
+    """Return whether an array is a rotation matrix, whose numbers may be rounded."""
+    if given.shape != (3, 3):
+        return False
+    deviation = np.abs(given @ given.T - np.eye(3)).max()
+    return bool(deviation < ROUNDED < np.linalg.det(given))
 
 
 @settings
@@ -189,12 +197,12 @@ class CameraFile:
 class OwnCamera:
     """A user's camera."""
 
-    files: tuple[Path, ...]  # from which it was read, its own first
-    keys: CameraFile  # of the file
-    matrix: FloatArray  # (3, 3) [px], of intrinsics
+    files: tuple[Path, ...]  # the files from which it was read, its own first
+    keys: CameraFile  # content of the files
+    matrix: FloatArray  # (3, 3) [px], matrix of intrinsics
     lens: str  # a key of `LENSES`
     distortion: tuple[float, ...]  # its coefficients [1]
-    second: OwnCamera | None  # of a stereo pair; None for a single camera
+    second: OwnCamera | None  # the other one of a stereo pair; None for a single camera
 
     @property
     def name(self) -> str:
@@ -211,8 +219,10 @@ class OwnCamera:
     @cached_property
     def pinhole(self) -> PinholeCamera:
         """An ideal camera with its size and horizontal focal length."""
-        fov = 2.0 * math.degrees(math.atan(0.5 * self.keys.height / float(self.matrix[0, 0])))
-        return PinholeCamera(self.keys.width, self.keys.height, fov, far=2.0 * MAX_PLACE["base"])
+        focal = float(self.matrix[0, 0])
+        vertical_fov = 2.0 * math.degrees(math.atan(0.5 * self.keys.height / focal))
+        far = 2.0 * MAX_PLACE["base"]
+        return PinholeCamera(self.keys.width, self.keys.height, vertical_fov, far=far)
 
     def sensing(self, usual: SensingConfig, period: float) -> SensingConfig:
         """Return the settings of a sensor with this camera's timing and noise.
@@ -220,15 +230,15 @@ class OwnCamera:
         Raises:
             ValueError: a noise that cannot be read.
         """
-        keys, changes = self.keys, dict[str, Any]()
+        keys = self.keys
+        changes: dict[str, Any] = {}
         if keys.rate is not None:
             changes["frame_period"] = frame_time(f"camera {self.name}", keys.rate, period)
-        changes |= {} if keys.latency is None else {"latency": keys.latency}
-        return override(
-            str(self.files[0]),
-            usual,
-            changes | ({"feature_noise": keys.noise} if keys.noise else {}),
-        )
+        if keys.latency is not None:
+            changes["latency"] = keys.latency
+        if keys.noise:
+            changes["feature_noise"] = keys.noise
+        return override(str(self.files[0]), usual, changes)
 
 
 def frame_time(what: str, rate: float, period: float) -> float:
@@ -237,15 +247,18 @@ def frame_time(what: str, rate: float, period: float) -> float:
     It is a multiple of the control `period` [s] where the two are nearly in step, and else that of the rate; where two
     or more are delivered in each period, one arrives at every control instant: 0.
     """
-    frames = rate * period
-    whole = max(1, round(1e3 / rate)) / 1e3
-    if round(frames) > 1 and abs(frames / round(frames) - 1.0) < ROUNDED:
+    frames = rate * period  # in each period
+    whole_frames = round(frames)
+    if whole_frames > 1 and abs(frames / whole_frames - 1.0) < ROUNDED:
         return 0.0
-    if abs(max(1, round(1.0 / frames)) * frames - 1.0) < IN_STEP:
-        return round(1.0 / frames) * period
-    near = abs(whole * rate - 1.0) < MAX_ROUNDED
-    if near and abs(round(whole / period) * period - whole) <= ROUNDED * period:
-        return whole
+    whole_periods = round(1.0 / frames)
+    if abs(max(1, whole_periods) * frames - 1.0) < IN_STEP:
+        return whole_periods * period
+    in_milliseconds = max(1, round(1e3 / rate)) / 1e3
+    if abs(in_milliseconds * rate - 1.0) < MAX_ROUNDED:
+        off = abs(round(in_milliseconds / period) * period - in_milliseconds)
+        if off <= ROUNDED * period:
+            return in_milliseconds
     clocks = f"a frame takes {1e3 / rate:g} ms and a control period {1e3 * period:g} ms"
     remark(f"{what}: {clocks}, so delays change; run.period={rate:.9g}Hz helps")
     return 1.0 / rate
@@ -257,27 +270,36 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
     Raises:
         ValueError: a file that cannot be used; one line with its path.
     """
-    toml = path.suffix.lower() == ".toml"
-    values = read_toml("camera file", path) if toml else {"intrinsics": path.name}
-    values |= {key: in_rows(value) for key, value in values.items() if key == "matrix"}
+    is_toml = path.suffix.lower() == ".toml"
+    values: dict[str, Any] = {"intrinsics": path.name}
+    if is_toml:
+        values = read_toml("camera file", path)
+    if "matrix" in values:
+        values["matrix"] = in_rows(values["matrix"])
     keys = override(f"camera file {path}", CameraFile(), values)
     if second and keys.second:
         raise ValueError(
             f"camera file {path} is the second of a pair and must name no other, got {keys.second}"
         )
     with configuration_errors(f"camera file {path}: "):
-        files = [path, path.parent / keys.intrinsics] if toml and keys.intrinsics else [path]
+        files = [path]
+        if is_toml and keys.intrinsics:
+            files.append(path.parent / keys.intrinsics)
         if keys.intrinsics:
             read = read_intrinsics(files[-1])
-            if toml and (twice := sorted(set(read) & set(values))):
+            twice = sorted(set(read) & set(values))
+            if is_toml and twice:
                 raise ValueError(
                     f"{twice[0]} is given here and by {keys.intrinsics}, its intrinsics; leave one out"
                 )
             keys = override(files[-1].name, keys, read)
-        pair = read_camera(path.parent / keys.second, second=True) if keys.second else None
-        camera = OwnCamera(
-            (*files, *(pair.files if pair else ())), keys, _matrix(keys), *_lens(keys), pair
-        )
+        other = None
+        if keys.second:
+            other = read_camera(path.parent / keys.second, second=True)
+            files += other.files
+        matrix = _matrix(keys)
+        lens, distortion = _lens(keys)
+        camera = OwnCamera(tuple(files), keys, matrix, lens, distortion, other)
         _check(camera)
     return camera
 
@@ -289,29 +311,39 @@ def _matrix(keys: CameraFile) -> FloatArray:
             f'noise needs its unit, such as "0.5px", or "2mm" for places by depth; got {keys.noise:g}'
         )
     for name, (unit, least, most) in RANGES.items():
-        if (value := getattr(keys, name)) is not None and not least <= value <= most:
+        value = getattr(keys, name)
+        if value is not None and not least <= value <= most:
             raise ValueError(
                 f"{name} must be given in {unit}, from {least:g} to {most:g}, got {value:g}"
             )
-    size = keys.width, keys.height
     if bool(keys.matrix) == (keys.vertical_fov is not None):
         came = "both" if keys.matrix else "neither"
         raise ValueError(f"either matrix [px] or vertical_fov [deg] must be given, got {came}")
-    f = 0.5 * size[1] / math.tan(math.radians(keys.vertical_fov or 90.0) / 2.0)
-    rows = keys.matrix or ((f, 0.0, size[0] / 2.0), (0.0, f, size[1] / 2.0), (0.0, 0.0, 1.0))
-    K = np.array(rows) if [len(row) for row in rows] == [3, 3, 3] else np.zeros((3, 3))
-    if (K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0.0, 0.0, 0.0, 0.0, 1.0)).any():
+    width = keys.width
+    height = keys.height
+    rows = keys.matrix
+    if keys.vertical_fov is not None:
+        f = 0.5 * height / math.tan(math.radians(keys.vertical_fov) / 2.0)
+        rows = ((f, 0.0, width / 2.0), (0.0, f, height / 2.0), (0.0, 0.0, 1.0))
+    K = np.zeros((3, 3))
+    if [len(row) for row in rows] == [3, 3, 3]:
+        K = np.array(rows)
+    if K[0, 1] != 0.0 or K[1, 0] != 0.0 or (K[2] != (0.0, 0.0, 1.0)).any():
         raise ValueError(f"matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px, got {rows}")
-    for f in (float(K[0, 0]), float(K[1, 1])):
-        if not FOCAL[0] * size[0] <= f <= FOCAL[1] * size[0]:
+    min_focal, max_focal = FOCAL
+    for focal in (float(K[0, 0]), float(K[1, 1])):
+        if not min_focal * width <= focal <= max_focal * width:
             wanted = "in px it is the focal length in mm over the side of a pixel in mm"
             raise ValueError(
-                f"matrix: a focal length of {f:g} px does not fit a width of {size[0]} px; {wanted}"
+                f"matrix: a focal length of {focal:g} px does not fit a width of {width} px; {wanted}"
             )
-    if not ((K[:2, 2] > 0.0) & (K[:2, 2] < size)).all():
-        raise ValueError(f"matrix: the principal point {K[:2, 2].tolist()} px must be in the image")
-    if (np.abs(K[:2, 2] / size - 0.5) > MAX_OFF).any():
-        where = f"the principal point {K[:2, 2].tolist()} px is far from the middle of {size[0]} × {size[1]} px"
+    size = (width, height)
+    principal_point = K[:2, 2]
+    came = str(principal_point.tolist())
+    if not ((principal_point > 0.0) & (principal_point < size)).all():
+        raise ValueError(f"matrix: the principal point {came} px must be in the image")
+    if (np.abs(principal_point / size - 0.5) > MAX_OFF).any():
+        where = f"the principal point {came} px is far from the middle of {width} × {height} px"
         remark(f"matrix: {where}; are cx and cy, or width and height, exchanged?")
     return K
 
@@ -336,6 +368,7 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
         return _named_coefficients(lens, given)
     count = len(given)
     if not lens:
+        # A file that does not name its model has that of OpenCV with as many coefficients.
         if count == 4 and any(given):
             remark(
                 'distortion of four numbers is k1, k2, p1, p2; of a fisheye, write distortion_model = "equidistant"'
@@ -344,12 +377,14 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
         if any(given[5:]):
             lens = "rational_polynomial"
     wanted = len(LENSES[lens])
-    whole = count >= wanted or not any(given[5:])
-    if not whole or any(given[wanted:]) or 0 < count < 4 or (lens == "equidistant" and not count):
+    is_cut = count < wanted and any(given[5:])
+    is_short = 0 < count < 4 or (lens == "equidistant" and not count)
+    if is_cut or is_short or any(given[wanted:]):
         raise ValueError(
             f"distortion must be of {lens} with {', '.join(LENSES[lens])}, got {given}; wanted {WANTED}"
         )
-    return _least_lens(lens, (*given, *(0.0,) * wanted)[:wanted])
+    zeros = (0.0,) * wanted
+    return _least_lens(lens, (*given, *zeros)[:wanted])
 
 
 def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tuple[float, ...]]:
@@ -404,59 +439,75 @@ def turning_point(coefficients: Sequence[float]) -> float:
     rate = [7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0]
     if not any(others):
         return _least_root(rate)
+    # r N / D turns back where (r N)' D − r N D' = 0, with N = 1 + k₁ s + k₂ s² + k₃ s³, D = 1 + k₄ s + k₅ s² + k₆ s³,
+    # s = r² and derivatives by r.
     k4, k5, k6 = others
     below = [k6, k5, k4, 1.0]
-    bent = np.polymul([2.0 * k3, 2.0 * k2, 2.0 * k1, 2.0], [3.0 * k6, 2.0 * k5, k4, 0.0])
-    return min(_least_root(below), _least_root(np.polysub(np.polymul(rate, below), bent)))
+    below_rate = np.polymul([2.0 * k3, 2.0 * k2, 2.0 * k1, 2.0], [3.0 * k6, 2.0 * k5, k4, 0.0])
+    whole_rate = np.polysub(np.polymul(rate, below), below_rate)
+    return min(_least_root(below), _least_root(whole_rate))
 
 
 def _least_root(polynomial: npt.ArrayLike) -> float:
     """Return the least positive root of a polynomial; a million where it has none."""
     roots = np.roots(polynomial)
-    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return float(min(real, default=ENDLESS))
+    is_real = np.abs(roots.imag) < 1e-9 * np.abs(roots)
+    positive = roots.real[is_real & (roots.real > 0.0)]
+    return float(min(positive, default=ENDLESS))
 
 
 def _check(camera: OwnCamera) -> None:
-    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together.
+    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together."""
+    _check_distortion(camera)
+    if camera.second is not None:
+        _check_second(camera, camera.second)
 
-    The image of a fisheye may be a circle that does not reach the corners: of it the nearest border counts.
+
+def _check_distortion(camera: OwnCamera) -> None:
+    """Refuse a distortion that folds the image; remark on one that moves points far.
+
+    The image of a fisheye may be a circle that does not reach the corners: its nearest border counts.
     """
-    D, K, keys = camera.distortion, camera.matrix, camera.keys
-    far = [
-        max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))
-    ]
+    D = camera.distortion
+    K = camera.matrix
+    keys = camera.keys
+    # Distances of the principal point from the further borders, over the focal length
+    far_u = max(K[0, 2], keys.width - K[0, 2]) / K[0, 0]
+    far_v = max(K[1, 2], keys.height - K[1, 2]) / K[1, 1]
     fisheye = camera.lens == "equidistant"
     turn = turning_point(D)
     last = (1.0 - ROUNDED_ROOT) * turn
-    edge = math.hypot(*far)
+    edge = math.hypot(far_u, far_v)
     tangential = 3.0 * math.hypot(*D[2:4])
     if fisheye:
         tangential = 0.0
-        edge = min(*far, MAX_ANGLE)
+        edge = min(far_u, far_v, MAX_ANGLE)
         last = math.atan(math.sqrt(last)) ** 2
     reach = math.sqrt(last) * float(stretch(D, np.array(last)))
     if reach < edge and not (fisheye and turn >= ENDLESS):
         image = f"an image of {keys.width} × {keys.height} px before its corners, with this matrix"
         raise ValueError(f"distortion {list(D)} folds {image}; take them from one calibration")
     squares = np.linspace(0.0, min(edge**2, last))
-    if (
-        moved := (np.abs(stretch(D, squares) - 1.0) + tangential * np.sqrt(squares)).max()
-    ) > MAX_MOVED:
+    radial = np.abs(stretch(D, squares) - 1.0)
+    moved = (radial + tangential * np.sqrt(squares)).max()
+    if moved > MAX_MOVED:
         much = f"moves points by {moved:.0%} of their distance from the middle; coefficients"
         remark(
             f"distortion {list(D)} {much} of OpenCV are no percent, and {', '.join(LENSES[camera.lens])}"
         )
-    if camera.second is not None:
-        pair = [
-            (each.keys.width, each.keys.height, each.keys.pose.frame)
-            for each in (camera, camera.second)
-        ]
-        if pair[0] != pair[1]:
-            raise ValueError(
-                f"{keys.second}, the second camera, must have the same width, height and pose.frame"
-            )
-        if fisheye != (camera.second.lens == "equidistant"):
-            raise ValueError(
-                f"{keys.second}, the second camera, must be a fisheye (equidistant) where the first is one"
-            )
+
+
+def _check_second(camera: OwnCamera, second: OwnCamera) -> None:
+    """Refuse a second camera of a pair whose image, mount or kind of lens is not that of the first."""
+    name = camera.keys.second
+    first_keys = camera.keys
+    second_keys = second.keys
+    same_size = (first_keys.width, first_keys.height) == (second_keys.width, second_keys.height)
+    if not same_size or first_keys.pose.frame != second_keys.pose.frame:
+        raise ValueError(
+            f"{name}, the second camera, must have the same width, height and pose.frame"
+        )
+    if (camera.lens == "equidistant") != (second.lens == "equidistant"):
+        raise ValueError(
+            f"{name}, the second camera, must be a fisheye (equidistant) where the first is one"
+        )

@@ -33,20 +33,19 @@ FOCAL_NAMES: Final = (
     ("fl_x", "fl_y", "cx", "cy"),
     ("mu", "mv", "u0", "v0"),
 )
-LENSES: Final[
-    Mapping[str, tuple[str, ...]]
-] = {  # ROS's name of a model -> coefficients of OpenCV, in its order
+# ROS's name of a model -> coefficients of OpenCV, in its order
+LENSES: Final[Mapping[str, tuple[str, ...]]] = {
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
     "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
 FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
 PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
-# In names of keys, or whole names.
+# Parts of names, or whole names, of keys that may hold a distortion
 DISTORTION: Final = re.compile(
     r"dist(?!ance)|coeff|radial|tangential|^kc$|^[kp]_?\d$", re.IGNORECASE
 )
-# That PyYAML takes for texts
+# Numbers that PyYAML takes for texts
 NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]\.\d+")
 
 
@@ -65,14 +64,7 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"{path.name} has no image_width")  # noqa: TRY004 - as of a mapping without it
     found = _flat(_first_camera(path, found))
-    keys = dict[str, Any]()
-    for key, names in NAMES.items():
-        given = {name: _data(found[name]) for name in names if name in found}
-        for name, value in given.items():
-            if value != keys.setdefault(key, value):
-                raise ValueError(
-                    f"{path.name} has {next(iter(given))} and another {name}; leave one out"
-                )
+    keys = _known_keys(path, found)
     _check_part(path, found, keys)
     projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
     if projection and "matrix" not in keys:
@@ -82,10 +74,11 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     for name in ("width", "height", "matrix"):
         if name not in keys:
             raise ValueError(f"{path.name} has no {NAMES[name][0]}")
-    if "distortion" not in keys and (other := _distortions(found)):
-        raise ValueError(f"{path.name} has {other[0]!r}; wanted the name distortion_coefficients")
+    others = _distortions(found)
+    if "distortion" not in keys and others:
+        raise ValueError(f"{path.name} has {others[0]!r}; wanted the name distortion_coefficients")
     if "distortion_model" in keys:
-        # An empty one stands for none in ROS
+        # An empty one stands for none in ROS.
         keys["distortion_model"] = keys["distortion_model"] or "none"
     if projection and plain_name(projection) not in PINHOLES:
         keys["distortion_model"] = projection
@@ -94,10 +87,23 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     return keys | {"matrix": in_rows(keys["matrix"])}
 
 
+def _known_keys(path: Path, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that a file has under one of the `NAMES` of a key, by the keys of `CameraFile`."""
+    keys = dict[str, Any]()
+    for key, names in NAMES.items():
+        given = {name: _data(found[name]) for name in names if name in found}
+        for name, value in given.items():
+            if value != keys.setdefault(key, value):
+                first = next(iter(given))
+                raise ValueError(f"{path.name} has {first} and another {name}; leave one out")
+    return keys
+
+
 def in_rows(value: Any) -> Any:  # noqa: ANN401 - a value of a file
     """Return a list of nine numbers as three rows, and anything else as it is."""
-    flat = isinstance(value, list) and len(value) == 9
-    return [value[row : row + 3] for row in (0, 3, 6)] if flat else value
+    if isinstance(value, list) and len(value) == 9:
+        return [value[:3], value[3:6], value[6:]]
+    return value
 
 
 def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
@@ -118,24 +124,24 @@ def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
         raise ValueError(
             f"{path.name} is XML; wanted YAML, which OpenCV writes where the name ends in .yml"
         )
+    if text.startswith("%YAML"):
+        # OpenCV writes a directive that PyYAML does not read.
+        text = text.partition("\n")[2]
     try:
-        documents = yaml.load_all(
-            text.partition("\n")[2] if text.startswith("%YAML") else text, Loader
-        )
-        return next(documents, None)  # `ros2 topic echo` puts --- after each message
+        documents = yaml.load_all(text, Loader)
+        # `ros2 topic echo` puts --- after each message.
+        return next(documents, None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(
-            f"{path.name} is not valid YAML: {' '.join(str(error).split())}"
-        ) from error
+        cause = " ".join(str(error).split())
+        raise ValueError(f"{path.name} is not valid YAML: {cause}") from error
 
 
 def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:
     """Return the first camera of a chain of kalibr, and the keys of any other file as they are."""
-    cameras = [
-        name
-        for name in found
-        if re.fullmatch(r"cam\d+", str(name)) and isinstance(found[name], dict)
-    ]
+    cameras = []
+    for name, value in found.items():
+        if re.fullmatch(r"cam\d+", str(name)) and isinstance(value, dict):
+            cameras.append(name)
     if not cameras:
         return found
     if len(cameras) > 1:
@@ -152,9 +158,9 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
             keys.setdefault(name.partition(".")[2], value)
         if name in PARTS and isinstance(value, dict):
             keys |= value
-    pair = [keys[name] for name in SIZES if name in keys]
-    if pair and isinstance(pair[0], list) and len(pair[0]) == 2:
-        keys["image_width"], keys["image_height"] = pair[0]
+    size = next((keys[name] for name in SIZES if name in keys), None)
+    if isinstance(size, list) and len(size) == 2:
+        keys["image_width"], keys["image_height"] = size
     numbers = keys.get("intrinsics")
     for names in FOCAL_NAMES:
         if all(name in keys for name in names):
@@ -164,10 +170,8 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
         keys.setdefault("camera_matrix", [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
     given = {name: keys[name] for name in LENSES["rational_polynomial"] if name in keys}
     if "mu" in keys:
-        given = {
-            name: keys.get(other, 0.0)
-            for name, other in zip(LENSES["equidistant"], FISHEYE_OF_VINS, strict=True)
-        }
+        names_in_vins = zip(LENSES["equidistant"], FISHEYE_OF_VINS, strict=True)
+        given = {name: keys.get(other, 0.0) for name, other in names_in_vins}
     if given and not any(name in keys for name in NAMES["distortion"]):
         keys["distortion_coefficients"] = given
     return keys
@@ -205,9 +209,15 @@ def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
 
 def _check_part(path: Path, found: Mapping[str, Any], keys: Mapping[str, Any]) -> None:
     """Refuse a message of ROS about a part of a larger image."""
-    roi = found["roi"] if isinstance(found.get("roi"), dict) else {}
-    parts = found.get("binning_x"), found.get("binning_y"), roi.get("width"), roi.get("height")
-    full = 1, 1, keys.get("width"), keys.get("height")
-    if any(part not in (None, 0, whole) for part, whole in zip(parts, full, strict=True)):
+    roi = found.get("roi")
+    if not isinstance(roi, dict):
+        roi = {}
+    given_and_whole = (
+        (found.get("binning_x"), 1),
+        (found.get("binning_y"), 1),
+        (roi.get("width"), keys.get("width")),
+        (roi.get("height"), keys.get("height")),
+    )
+    if any(given not in (None, 0, whole) for given, whole in given_and_whole):
         part = "binning or a region (roi) leaves a part; write size and matrix of the image as it comes into a TOML"
         raise ValueError(f"{path.name} is of a larger image, of which {part}")

@@ -41,15 +41,17 @@ TIMES: Final = ("latency", "command_delay", "lag")
 CAMERA: Final = tuple(f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z"))
 TOOL: Final = ("tool_x", "tool_y", "tool_z")
 LENS: Final = ("focal", "centre_u", "centre_v", "distortion")
-MAX_DEVIATION: Final = 0.5  # [s, m, rad or 1] usual one of a parameter
-MIN_LENGTH: Final = 1e-6  # [m] of a translation that is a length
+MAX_DEVIATION: Final = 0.5  # [s, m, rad or 1] usual largest deviation of a parameter
+MIN_LENGTH: Final = 1e-6  # [m] a shorter part of a translation is no length
 Rows = tuple[tuple[Number, ...], ...]
 
 
 def parameter_names(arm: SerialArm) -> tuple[str, ...]:
     """Return the names of all parameters of an arm and its camera."""
-    joints = [f"{kind}_{name}" for kind in ("gear", "zero") for name in arm.joint_names]
-    return (*TIMES, *CAMERA, *TOOL, *LENS, *joints, *(name for name, _, _ in _links(arm)))
+    gears = [f"gear_{name}" for name in arm.joint_names]
+    zeros = [f"zero_{name}" for name in arm.joint_names]
+    links = [name for name, _, _ in _links(arm)]
+    return (*TIMES, *CAMERA, *TOOL, *LENS, *gears, *zeros, *links)
 
 
 def _links(arm: SerialArm) -> Iterator[tuple[str, int, int]]:
@@ -64,17 +66,20 @@ def deviated(model: RobotModel, values: Mapping[str, float]) -> RobotModel:
     def given(*names: str) -> FloatArray:
         return np.array([values.get(name, 0.0) for name in names])
 
-    arm, pose = model.arm, np.array(model.camera)
-    translation = arm.translation.copy()
-    for name, row, axis in _links(arm):
+    planned = model.arm
+    translation = planned.translation.copy()
+    for name, row, axis in _links(planned):
         translation[row, axis] *= 1.0 + values.get(name, 0.0)
+    zeros = given(*(f"zero_{name}" for name in planned.joint_names))
+    gears = given(*(f"gear_{name}" for name in planned.joint_names))
     arm = replace(
-        arm,
+        planned,
         translation=translation,
-        joint_offset=arm.joint_offset + given(*(f"zero_{name}" for name in arm.joint_names)),
-        gear_ratio=arm.gear_ratio * (1.0 + given(*(f"gear_{name}" for name in arm.joint_names))),
-        tool=arm.tool + given(*TOOL),
+        joint_offset=planned.joint_offset + zeros,
+        gear_ratio=planned.gear_ratio * (1.0 + gears),
+        tool=planned.tool + given(*TOOL),
     )
+    pose = np.array(model.camera)
     pose[:3, :3] = pose[:3, :3] @ rotation_matrix(given(*CAMERA[:3]))
     pose[:3, 3] += given(*CAMERA[3:])
     return model.with_arm(arm).with_camera(pose).with_lens(given(*LENS))
@@ -90,16 +95,19 @@ def ball_rates(
     """
     ball = frames[:, -1, :3] @ np.append(arm.tool, 1.0)
     turns = arm.motions(frames, ball[:, None])[:, 0]
-    # Columns; the i-th link is given in the i-th of them
+    # The i-th translation is along the axes of the frame before it, those of the first along the base's.
     axes = np.insert(frames[..., :3, :3], 0, np.eye(3), axis=1)
-    rates = {
-        name: model.arm.translation[row, axis] * axes[:, row, :, axis]
-        for name, row, axis in _links(arm)
-    }
-    rates |= {name: axes[:, -1, :, axis] for axis, name in enumerate(TOOL)}
+    rates = {}
+    for name, row, axis in _links(arm):
+        rates[name] = model.arm.translation[row, axis] * axes[:, row, :, axis]
+    for axis, name in enumerate(TOOL):
+        rates[name] = axes[:, -1, :, axis]
     for i, name in enumerate(arm.joint_names):
-        rates[name], rates[f"zero_{name}"] = turns[:, i], turns[:, i] / arm.gear_ratio[i]
-        rates[f"gear_{name}"] = rates[f"zero_{name}"] * model.arm.gear_ratio[i] * q[:, i, None]
+        # `turns` is by the reported position; the true angle turns by the gear ratio as much.
+        by_angle = turns[:, i] / arm.gear_ratio[i]
+        rates[name] = turns[:, i]
+        rates[f"zero_{name}"] = by_angle
+        rates[f"gear_{name}"] = by_angle * model.arm.gear_ratio[i] * q[:, i, None]
     return ball, rates
 
 
@@ -135,15 +143,18 @@ class TwinFile:
 class Twin:
     """A robot as it was identified from a log."""
 
-    path: Path  # of the file
-    keys: TwinFile  # of the file
+    path: Path  # the file
+    keys: TwinFile  # its content
 
     def values(self, seed: int) -> dict[str, float]:
         """Return the parameters of a run with a seed by name."""
-        keys, values = self.keys, {**self.keys.mean, "latency": self.keys.camera.latency or 0.0}
-        z = named_generator(seed, "twin").standard_normal(len(keys.factor)) * (seed > 0)
-        change = z @ np.array(keys.factor) if keys.factor else np.zeros(len(keys.parameters))
-        for name, own in zip(keys.parameters, change.tolist(), strict=True):
+        keys = self.keys
+        values = {**keys.mean, "latency": keys.camera.latency or 0.0}
+        deviation = np.zeros(len(keys.parameters))
+        if keys.factor:
+            z = named_generator(seed, "twin").standard_normal(len(keys.factor)) * (seed > 0)
+            deviation = z @ np.array(keys.factor)
+        for name, own in zip(keys.parameters, deviation.tolist(), strict=True):
             values[name] = values.get(name, 0.0) + own
         return values
 
@@ -151,9 +162,9 @@ class Twin:
         """Return the true robot of a run with a seed.
 
         Args:
-            nominal: which controllers know.
-            sensing: of the run.
-            seed: of the run.
+            nominal: the robot that controllers know.
+            sensing: the sensing of the run.
+            seed: the seed of the run.
             exact: whether no mismatch moves the robot.
 
         Raises:
@@ -166,39 +177,53 @@ class Twin:
         if not exact:
             words = "leave the mismatch out, and axes, but for camera_move and those of sensor, gears and tool"
             raise ValueError(f"twin {self.path} draws its robot from a posterior: {words}")
-        return deviated(nominal.with_camera(self.keys.camera.pose.matrix), self.values(seed))
+        planned = nominal.with_camera(self.keys.camera.pose.matrix)
+        return deviated(planned, self.values(seed))
 
     def times(self, seed: int) -> dict[str, float]:
         """Return the known ones of latency, delay and lag of a run by key of a plant [s], rounded to milliseconds."""
         drawn = self.values(seed)
-        given: dict[str, float] = {
-            name: max(0, round(1e3 * drawn[name])) / 1e3 for name in TIMES if name in drawn
-        }
-        return {"sensing.latency": given.pop("latency"), **given}
+        times: dict[str, float] = {}
+        for name in TIMES:
+            if name in drawn:
+                key = "sensing.latency" if name == "latency" else name
+                times[key] = max(0, round(1e3 * drawn[name])) / 1e3
+        return times
 
     def plant_settings(self, config: Any, period: float) -> dict[str, Any]:  # noqa: ANN401 - of any plant
         """Return the settings of the mean, nested, of a plant with a configuration and a control `period` [s]."""
-        keys, times, unit = (
-            self.keys,
-            self.times(0),
-            "" if self.keys.sensing == "position" else "px",
-        )
-        sensing: dict[str, Any] = {"latency": times.pop("sensing.latency")}
-        sensing |= {"drop_probability": keys.lost_frames, "outliers": keys.outliers}
+        keys = self.keys
+        times = self.times(0)
+        sensing = {"latency": times.pop("sensing.latency")}
+        sensing |= self._sensing_settings(period)
+        sensing |= keys.plant.get("sensing", {})
+        given = {**times, **keys.plant, "sensing": sensing}
+        known = {each.name for each in fields(config)}
+        return {name: value for name, value in given.items() if name in known}
+
+    def _sensing_settings(self, period: float) -> dict[str, Any]:
+        """Return losses, noise and rate of the camera as settings of a sensor, for a control `period` [s]."""
+        keys = self.keys
+
+        def with_unit(size: float) -> float | str:
+            """A setting without a unit is in metres."""
+            return size if keys.sensing == "position" else f"{size}px"
+
+        sensing: dict[str, Any] = {
+            "drop_probability": keys.lost_frames,
+            "outliers": keys.outliers,
+        }
         if keys.covariance:
             scale = float(np.sqrt(np.trace(keys.covariance) / len(keys.covariance)))
             shape = np.linalg.cholesky(np.array(keys.covariance)) / scale
-            sensing |= {
-                "feature_noise": f"{scale}{unit}" if unit else scale,
-                "noise_shape": shape.tolist(),
-            }
+            sensing["feature_noise"] = with_unit(scale)
+            sensing["noise_shape"] = shape.tolist()
         if keys.outliers > 0.0:
-            sensing["outlier_size"] = f"{keys.outlier_size}{unit}" if unit else keys.outlier_size
-        if (rate := keys.camera.rate) is not None and abs(rate * period - 1.0) > ROUNDED:
+            sensing["outlier_size"] = with_unit(keys.outlier_size)
+        rate = keys.camera.rate
+        if rate is not None and abs(rate * period - 1.0) > ROUNDED:
             sensing["frame_period"] = frame_time(f"twin {self.path}", rate, period)
-        known = {each.name for each in fields(config)}
-        given = {**times, **keys.plant, "sensing": sensing | keys.plant.get("sensing", {})}
-        return {name: value for name, value in given.items() if name in known}
+        return sensing
 
 
 def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
@@ -207,13 +232,13 @@ def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
     Raises:
         ValueError: an unknown key or parameter, or a value that cannot be used.
     """
-    keys, known, what = (
-        override(f"twin {path}", TwinFile(), values),
-        parameter_names(arm),
-        f"twin {path}",
-    )
+    what = f"twin {path}"
+    keys = override(what, TwinFile(), values)
+    known = parameter_names(arm)
     for name in (*keys.mean, *keys.parameters):
-        if name not in known or (name in keys.mean and name in ("latency", *CAMERA)):
+        # The means of latency and camera are among the keys of the camera.
+        is_elsewhere = name in keys.mean and name in ("latency", *CAMERA)
+        if name not in known or is_elsewhere:
             raise ValueError(
                 f"{what}: {keys.robot} has no parameter {name!r} there{did_you_mean(name, known)}"
             )
@@ -223,18 +248,23 @@ def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
         raise ValueError(
             f"{what}: each row of factor needs {len(keys.parameters)} numbers, one for each parameter"
         )
-    sizes = [float(np.linalg.norm(column)) for column in zip(*keys.factor, strict=True)]
-    for name, value in (*keys.mean.items(), *zip(keys.parameters, sizes, strict=False)):
+    spreads = [float(np.linalg.norm(column)) for column in zip(*keys.factor, strict=True)]
+    deviations = (*keys.mean.items(), *zip(keys.parameters, spreads, strict=False))
+    for name, value in deviations:
         if abs(value) > MAX_DEVIATION and not name.startswith("centre_"):
             remark(
                 f"{what}: {name} deviates by {value:g}, and usually by {MAX_DEVIATION:g} at most, in s, m, rad or 1"
             )
-    size = len(keys.covariance)
-    square = (
-        np.array(keys.covariance)
-        if {len(row) for row in keys.covariance} == {size}
-        else np.zeros((size, size))
-    )
-    if size and not (np.allclose(square, square.T) and np.linalg.eigvalsh(square)[0] > 0.0):
+    if keys.covariance and not _is_covariance(keys.covariance):
         raise ValueError(f"{what}: covariance must be a symmetric, positive definite matrix")
     return Twin(path, keys)
+
+
+def _is_covariance(rows: Rows) -> bool:
+    """Return whether rows are those of a symmetric, positive definite matrix."""
+    if any(len(row) != len(rows) for row in rows):
+        return False
+    matrix = np.array(rows)
+    if not np.allclose(matrix, matrix.T):
+        return False
+    return bool(np.linalg.eigvalsh(matrix)[0] > 0.0)
