@@ -10,35 +10,35 @@ an axis is refused.
 import re
 from collections import Counter, defaultdict
 from math import isclose
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import Check, listed, read_value, remark
 from servobench.plant.robot.files import Lengths
+from servobench.plant.robot.urdf_elements import Tree
 
 TURNING: Final = ("revolute", "continuous")
 MIN_JOINTS: Final = 3  # least number of rotating joints of an arm
-# In the name of a link or a joint
+# Parts of names: of the links and joints of fingers, of the joints of grippers, and of joints that turn a whole gripper
 FINGER: Final = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)
-GRIPPER: Final = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)  # in that of a joint
-# Turns a whole gripper
+GRIPPER: Final = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)
 WRIST: Final = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)
-MAX_STROKE: Final = (
-    0.1  # [m] longest travel of a sliding joint that is a finger without a name or a companion
-)
-MIRRORED: Final = (
-    0.01  # [1] largest relative difference of the distances of two fingers from their palm
-)
+# Longest travel of a sliding joint that is a finger without a name or a companion
+MAX_STROKE: Final = 0.1  # [m]
+# Largest relative difference of the distances of two fingers from their palm
+MIRRORED: Final = 0.01  # [1]
 LENGTHS: Final = Check.of(Lengths, bare=True)
-Ways = dict[str, list[Any]]  # link -> joints from the root to it, as yourdfpy reads them
+# A joint as yourdfpy, which is not typed, reads it
+JointElement: TypeAlias = Any
+Ways = dict[str, list[JointElement]]  # link -> joints from the root to it, as yourdfpy reads them
 
 
 class Joint(NamedTuple):
     """A rotating joint of the chain."""
 
-    joint: Any  # as yourdfpy reads it
+    joint: JointElement  # as yourdfpy reads it
     origin: FloatArray  # (4, 4), the joint in the frame of the turning joint before it, whose z axis is its own
     aligned: FloatArray  # (4, 4), the frame whose z axis is the joint's axis, in the frame of the joint's child link
 
@@ -52,7 +52,7 @@ class Chain(NamedTuple):
     ending: str  # the joints taken as the tool, and other chains as long; empty for none
 
 
-def find_chain(tree: Any, tip: str) -> Chain:  # noqa: ANN401 - yourdfpy is not typed
+def find_chain(tree: Tree, tip: str) -> Chain:
     """Return the chain from the base to a tip.
 
     Args:
@@ -72,26 +72,27 @@ def find_chain(tree: Any, tip: str) -> Chain:  # noqa: ANN401 - yourdfpy is not 
     way = ways[tip]
     if _count(way) < MIN_JOINTS:
         raise ValueError("it has no chain of at least three turning joints")
+    chain, flange = _along_way(way, tip, free)
+    ending = ""
+    if not named:
+        ending = _ending(tree, ways, free, tip, tool)
+    return Chain(chain, flange, tip, ending)
+
+
+def _along_way(way: list[JointElement], tip: str, free: Ways) -> tuple[list[Joint], FloatArray]:
+    """Return the rotating joints on the way to a tip, and the tip in the frame of the last one, (4, 4).
+
+    Raises:
+        ValueError: a joint that is not modelled, or has no axis or an impossible origin.
+    """
     chain = []
     pose = np.eye(4)
     for joint in way:
         if not _is_modelled(joint):
-            kind = (
-                f"is of type {joint.type}" if joint.mimic is None else "turns with another (mimic)"
-            )
-            other = _flange(
-                {link: way for link, way in free.items() if all(map(_is_modelled, way))}
-            )
-            remedy = 'write type="fixed" if it can stay at rest'
-            if _count(ways[other]) >= MIN_JOINTS:
-                remedy = f"name another link, such as #{other}"
-            raise ValueError(
-                f"joint {joint.name!r} on the way to {tip!r} {kind}, which is not modelled; {remedy}"
-            )
+            raise _not_modelled(joint, tip, free)
         place = pose_of(joint.origin)
-        read_value(
-            f"joint {joint.name!r}: origin", tuple(place[:3, 3].tolist()), LENGTHS, lambda: "m"
-        )
+        position = tuple(place[:3, 3].tolist())
+        read_value(f"joint {joint.name!r}: origin", position, LENGTHS, lambda: "m")
         pose = pose @ place
         if turns(joint):
             if not np.any(joint.axis):
@@ -100,14 +101,27 @@ def find_chain(tree: Any, tip: str) -> Chain:  # noqa: ANN401 - yourdfpy is not 
                 )
             aligned = _along(np.asarray(joint.axis, dtype=np.float64))
             chain.append(Joint(joint, pose @ aligned, aligned))
+            # The link behind the joint is given in the joint's own frame, not in the aligned one.
             pose = aligned.T
-    ending = ""
-    if not named:
-        ending = _ending(tree, ways, free, tip, tool)
-    return Chain(chain, pose, tip, ending)
+    return chain, pose
 
 
-def _ways(tree: Any) -> Ways:  # noqa: ANN401
+def _not_modelled(joint: JointElement, tip: str, free: Ways) -> ValueError:
+    """Return the error about a joint on the way to a tip that is not modelled, with another tip if there is one."""
+    kind = "turns with another (mimic)"
+    if joint.mimic is None:
+        kind = f"is of type {joint.type}"
+    modelled = {link: way for link, way in free.items() if all(map(_is_modelled, way))}
+    other = _flange(modelled)
+    remedy = 'write type="fixed" if it can stay at rest'
+    if _count(modelled[other]) >= MIN_JOINTS:
+        remedy = f"name another link, such as #{other}"
+    return ValueError(
+        f"joint {joint.name!r} on the way to {tip!r} {kind}, which is not modelled; {remedy}"
+    )
+
+
+def _ways(tree: Tree) -> Ways:
     """Return the joints from the root to each link."""
     above = {joint.child: joint for joint in tree.joints}
     links = [link.name for link in tree.links]
@@ -149,58 +163,69 @@ def _ways(tree: Any) -> Ways:  # noqa: ANN401
     return ways
 
 
-def turns(joint: Any) -> bool:  # noqa: ANN401
+def turns(joint: JointElement) -> bool:
     """Return whether a joint rotates by itself."""
     return joint.type in TURNING and joint.mimic is None
 
 
-def _count(way: list[Any]) -> int:
+def _count(way: list[JointElement]) -> int:
     return sum(map(turns, way))
 
 
-def _is_modelled(joint: Any) -> bool:  # noqa: ANN401
+def _is_modelled(joint: JointElement) -> bool:
     return turns(joint) or joint.type == "fixed"
 
 
 def _flange(ways: Ways) -> str:
     """Return the link that is fixed to the last of the most rotating ones; that one itself if there is none."""
-    last = max(
-        ways, key=lambda name: (_count(ways[name]), bool(ways[name]) and turns(ways[name][-1]))
-    )
+
+    def rank(link: str) -> tuple[int, bool]:
+        """Most rotating joints first, and of those the link that is behind the last one itself."""
+        way = ways[link]
+        return _count(way), bool(way) and turns(way[-1])
+
+    last = max(ways, key=rank)
+    fixed = []
+    for link, way in ways.items():
+        if way and way[:-1] == ways[last] and way[-1].type == "fixed":
+            fixed.append(link)
     # Fingers and cameras follow after the flange; ROS puts the frame of a force sensor before it.
-    fixed = [
-        name
-        for name, way in ways.items()
-        if way and way[:-1] == ways[last] and way[-1].type == "fixed"
-    ]
-    return "flange" if "flange" in fixed else fixed[0] if fixed else last
+    if "flange" in fixed:
+        return "flange"
+    return fixed[0] if fixed else last
 
 
-def _tool(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
+def _tool(tree: Tree, ways: Ways) -> dict[str, str]:
     """Return why a rotating joint is one of the tool, by its name."""
     tool = _fingers(tree, ways)
     followers = Counter(joint.mimic.joint for joint in tree.joints if joint.mimic is not None)
-    onward = defaultdict[str, list[Any]](list)
+    onward = defaultdict[str, list[JointElement]](list)
     for joint in filter(turns, tree.joints):
         for before in ways[joint.parent]:
             onward[before.name].append(joint)
+    # The last joints come first, so that it is known of all joints behind one whether they are of the tool.
     for joint in sorted(filter(turns, tree.joints), key=lambda joint: -len(ways[joint.child])):
-        follows = any(other.name not in tool for other in onward[joint.name])
-        if follows or _count(ways[joint.parent]) < MIN_JOINTS:
+        leads_on = any(other.name not in tool for other in onward[joint.name])
+        if leads_on or _count(ways[joint.parent]) < MIN_JOINTS:
             continue
         if followers[joint.name]:
             tool[joint.name] = f"mimicked by {followers[joint.name]}"
-        elif (GRIPPER.search(joint.name) or FINGER.search(joint.child)) and not WRIST.search(
-            joint.name
-        ):
+        elif _is_gripper_by_name(joint):
             tool[joint.name] = "by its name"
     return tool
 
 
-def _fingers(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
+def _is_gripper_by_name(joint: JointElement) -> bool:
+    """Return whether the names of a joint and its link are those of a gripper, and not of a wrist that turns one."""
+    if WRIST.search(joint.name):
+        return False
+    return bool(GRIPPER.search(joint.name) or FINGER.search(joint.child))
+
+
+def _fingers(tree: Tree, ways: Ways) -> dict[str, str]:
     """Return the rotating joints of fingers, which may mimic others, as `_tool` does."""
     lengths = dict.fromkeys(ways, 0)  # link -> most rotating joints after it
-    branches = defaultdict[str, list[tuple[int, Any]]](list)
+    branches = defaultdict[str, list[tuple[int, JointElement]]](list)
     for joint in sorted(tree.joints, key=lambda joint: -len(ways[joint.child])):
         length = lengths[joint.child] + (joint.type in TURNING)
         lengths[joint.parent] = max(lengths[joint.parent], length)
@@ -209,8 +234,8 @@ def _fingers(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
     for link, parts in branches.items():
         longest = max(length for length, _ in parts)
         alike = [(length, joint) for length, joint in parts if 2 * length >= longest > 0]
-        is_palm = len(alike) > 1 and _count(ways[link]) >= max(MIN_JOINTS, longest)
-        if is_palm and _are_fingers(alike):
+        is_behind_arm = _count(ways[link]) >= max(MIN_JOINTS, longest)
+        if len(alike) > 1 and is_behind_arm and _are_fingers(alike):
             hands[link] = f"one of {len(alike)} fingers"
     found = {}
     for joint in filter(turns, tree.joints):
@@ -220,7 +245,7 @@ def _fingers(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
     return found
 
 
-def _are_fingers(branches: list[tuple[int, Any]]) -> bool:
+def _are_fingers(branches: list[tuple[int, JointElement]]) -> bool:
     """Return whether branches of one link are fingers: more than two, or called so, or two that mirror each other.
 
     A camera that turns and a bar beside the wrist are no fingers.
@@ -237,7 +262,7 @@ def _are_fingers(branches: list[tuple[int, Any]]) -> bool:
     return len(lengths) == 1 and isclose(*reaches, rel_tol=MIRRORED)
 
 
-def _ending(tree: Any, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) -> str:  # noqa: ANN401
+def _ending(tree: Tree, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) -> str:
     """Return a line on the joints after the last one of a chain, and on other chains as long.
 
     Raises:
@@ -250,52 +275,48 @@ def _ending(tree: Any, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) -
         if joint.type != "fixed" and moving and moving[-1].name == last.name:
             following.append(joint)
     mimicked = {joint.mimic.joint for joint in tree.joints if joint.mimic is not None}
-    if len(following) == 1 and following[0].name not in mimicked and _is_axis(following[0]):
-        joint = following[0]
-        remedy = f"#{tip} leaves it out"
-        raise ValueError(
-            f"joint {joint.name!r} after {last.name!r} is of type prismatic, which is not modelled; {remedy}"
-        )
+    if len(following) == 1:
+        (joint,) = following
+        if joint.name not in mimicked and _is_axis(joint):
+            remedy = f"#{tip} leaves it out"
+            raise ValueError(
+                f"joint {joint.name!r} after {last.name!r} is of type prismatic, which is not modelled; {remedy}"
+            )
     lines = []
     if following:
         why = [f"{joint.name} ({_reason(joint, tool)})" for joint in following]
-        taken = next(
-            (
-                f"; #{joint.child} would take it as a joint"
-                for joint in following
-                if joint.name in tool
-            ),
-            "",
-        )
+        taken = ""
+        rotating = [joint for joint in following if joint.name in tool]
+        if rotating:
+            taken = f"; #{rotating[0].child} would take it as a joint"
         lines.append(f"the tool, at rest, begins with {listed(why, 3)}{taken}")
-    equal = [
-        link
-        for link, way in free.items()
-        if way and turns(way[-1]) and _count(way) == _count(ways[tip])
-    ]
-    others = [f"#{link}" for link in equal if link != last.child]
+    others = []
+    for link, way in free.items():
+        is_end = way and turns(way[-1]) and link != last.child
+        if is_end and _count(way) == _count(ways[tip]):
+            others.append(f"#{link}")
     if others:
         lines.append(f"as many joints lead to {listed(others, 3)}")
     return "; ".join(lines)
 
 
-def _reason(joint: Any, tool: dict[str, str]) -> str:  # noqa: ANN401
+def _reason(joint: JointElement, tool: dict[str, str]) -> str:
+    """Return why a joint after the last one of a chain is of the tool."""
     if joint.mimic is not None:
         return f"mimics {joint.mimic.joint}"
     return tool.get(joint.name, str(joint.type))
 
 
-def _is_axis(joint: Any) -> bool:  # noqa: ANN401
+def _is_axis(joint: JointElement) -> bool:
     """Return whether a single sliding joint at the end of a chain is an axis of the arm and no finger."""
-    if (
-        joint.type != "prismatic"
-        or joint.mimic is not None
-        or GRIPPER.search(f"{joint.name} {joint.child}")
-    ):
+    if joint.type != "prismatic" or joint.mimic is not None:
         return False
-    if joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
+    if GRIPPER.search(f"{joint.name} {joint.child}"):
+        return False
+    limit = joint.limit
+    if limit is None or limit.lower is None or limit.upper is None:
         return True
-    return bool(joint.limit.upper - joint.limit.lower > MAX_STROKE)
+    return bool(limit.upper - limit.lower > MAX_STROKE)
 
 
 def _along(axis: FloatArray) -> FloatArray:
@@ -303,7 +324,10 @@ def _along(axis: FloatArray) -> FloatArray:
     z = axis / np.linalg.norm(axis)
     frame = np.eye(4)
     if z[2] < 1.0 - 1e-12:
-        side = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        # x is near the x axis, or if z is near it, near the y axis.
+        side = np.array([1.0, 0.0, 0.0])
+        if abs(z[0]) >= 0.9:
+            side = np.array([0.0, 1.0, 0.0])
         x = side - (side @ z) * z
         x /= np.linalg.norm(x)
         frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
@@ -312,4 +336,6 @@ def _along(axis: FloatArray) -> FloatArray:
 
 def pose_of(origin: FloatArray | None) -> FloatArray:
     """Return the pose (4, 4) of an origin; the identity without one."""
-    return np.eye(4) if origin is None else np.asarray(origin, dtype=np.float64)
+    if origin is None:
+        return np.eye(4)
+    return np.asarray(origin, dtype=np.float64)

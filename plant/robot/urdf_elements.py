@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from io import BytesIO
 from math import hypot, isfinite
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 from xml.etree import ElementTree as ET
 
 from servobench.plant.contract.faults import configuration_errors
@@ -23,13 +23,16 @@ from servobench.plant.contract.files import accessing
 from servobench.plant.contract.settings import listed, remark, suggest
 from servobench.plant.robot.arm import rpy_from_rotation
 
+# An element of lxml, and the robot that yourdfpy makes of a URDF; neither is typed.
+Element: TypeAlias = Any
+Tree: TypeAlias = Any
+
 RUN_XACRO: Final = "run xacro first, and give what it prints: `xacro FILE > arm.urdf`"
 READ_QUATERNION: Final = (
     'quat_xyzw of <origin>, which is read; ROS reads it in <robot version="1.1"> only'
 )
-ATTRIBUTES: Final[
-    Mapping[str, Mapping[str, int]]
-] = {  # element -> its attributes -> count of numbers, 0 for a text
+# Element -> its attributes -> count of numbers, 0 for a text
+ATTRIBUTES: Final[Mapping[str, Mapping[str, int]]] = {
     "link": {"name": 0, "type": 0},
     "inertial": {},
     "mass": {"value": 1},
@@ -56,7 +59,8 @@ ATTRIBUTES: Final[
         "k_velocity": 1,
     },
 }
-CHILDREN: Final[Mapping[str, tuple[str, ...]]] = {  # element -> known elements in it
+# Element -> known elements in it
+CHILDREN: Final[Mapping[str, tuple[str, ...]]] = {
     "link": ("inertial", "visual", "collision", "contact"),
     "inertial": ("origin", "mass", "inertia"),
     "joint": (
@@ -74,9 +78,8 @@ CHILDREN: Final[Mapping[str, tuple[str, ...]]] = {  # element -> known elements 
 ENDS: Final = ("parent", "child")
 # Elements of a joint whose values are geometry
 GEOMETRY: Final = ("origin", "axis", "limit", "mimic")
-SIMILAR: Final[
-    Mapping[str, tuple[str, ...]]
-] = {  # element -> likely meanings of an unknown element in it
+# Element -> likely meanings of an unknown element in it
+SIMILAR: Final[Mapping[str, tuple[str, ...]]] = {
     "robot": ("link", "joint"),
     "link": ("link", "joint"),
     "inertial": ("origin",),
@@ -96,7 +99,8 @@ DYNAMIC: Final = re.compile(r"effort|torque|current|velocity|accel|decel|jerk|da
 NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 INFINITE: Final = re.compile(r"[-+]?inf(inity)?", re.IGNORECASE)
 ZEROS: Final = re.compile(r"[-+.0\s]*")
-REMEDIES: Final = (  # mark in a word that is no number, and remedy
+# Mark in a word that is no number, and remedy
+REMEDIES: Final = (
     (re.compile(r"[${}()*/]|pi"), RUN_XACRO),
     (re.compile(","), "numbers have a decimal point and blanks between them"),
     (
@@ -104,14 +108,14 @@ REMEDIES: Final = (  # mark in a word that is no number, and remedy
         "units cannot be written: lengths are in m, angles in rad, masses in kg",
     ),
 )
-# As ROS does
+# Faults of XML that ROS tolerates as well
 TOLERATED: Final = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION", "ERR_RESERVED_XML_NAME")
 LIKENESS: Final = 0.75  # least ratio of difflib between a misspelt word and the one that is meant
 MAX_TURN: Final = 7.0  # [rad] largest usual angle of an rpy
 ROUNDED_UNIT: Final = 0.01  # largest deviation of a quaternion's norm from 1
 
 
-def read_elements(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
+def read_elements(path: Path) -> Tree:
     """Return links and joints of a URDF, as yourdfpy reads them.
 
     Raises:
@@ -133,21 +137,28 @@ def read_elements(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
         robot = _copy_robot(root, passed)
     if root.get("version", "1.0") != "1.0":
         passed.pop(READ_QUATERNION, None)
-    turns = " ".join(origin.get("rpy", "") for origin in robot.iter("origin")).split()
-    large = [turn for turn in turns if abs(float(turn)) > MAX_TURN]
-    if large:
-        remark(f"robot file {path} has an rpy of {large[0]}, and angles of a URDF are in rad")
+    _remark_on_degrees(path, robot)
     if passed:
         remark(f"robot file {path} has what URDF 1.0 has not: {listed(list(passed), 6)}")
-    return yourdfpy.URDF.load(
+    urdf = yourdfpy.URDF.load(
         BytesIO(ET.tostring(robot, encoding="utf-8")),
         build_scene_graph=False,
         load_meshes=False,
         build_collision_scene_graph=False,
-    ).robot
+    )
+    return urdf.robot
 
 
-def _parse(content: bytes) -> Any:  # noqa: ANN401 - lxml is not typed
+def _remark_on_degrees(path: Path, robot: ET.Element) -> None:
+    """Remark on an rpy that is too large for an angle in rad."""
+    for origin in robot.iter("origin"):
+        for angle in origin.get("rpy", "").split():
+            if abs(float(angle)) > MAX_TURN:
+                remark(f"robot file {path} has an rpy of {angle}, and angles of a URDF are in rad")
+                return
+
+
+def _parse(content: bytes) -> Element:
     """Return the root of a URDF without comments; prefixes may be undefined, as in ROS."""
     from lxml import etree  # noqa: PLC0415 - comes with yourdfpy
 
@@ -158,15 +169,14 @@ def _parse(content: bytes) -> Any:  # noqa: ANN401 - lxml is not typed
         raise ValueError(" ".join(str(error).split())) from error
     for fault in parser.error_log:
         if fault.type_name not in TOLERATED:
-            raise ValueError(
-                f"{' '.join(fault.message.split())}, line {fault.line}, column {fault.column}"
-            )
+            message = " ".join(fault.message.split())
+            raise ValueError(f"{message}, line {fault.line}, column {fault.column}")
     if _tag(root) != "robot":
         raise ValueError(f"its root is <{_tag(root)}>, and that of a URDF is <robot>")
     return root
 
 
-def _tag(element: Any) -> str:  # noqa: ANN401
+def _tag(element: Element) -> str:
     """Return the tag of an element with its prefix, if it has one."""
     name = str(element.tag).rpartition("}")[2]
     if element.prefix is None:
@@ -174,23 +184,24 @@ def _tag(element: Any) -> str:  # noqa: ANN401
     return f"{element.prefix}:{name}"
 
 
-def _refuse_xacro(root: Any) -> None:  # noqa: ANN401
+def _refuse_xacro(root: Element) -> None:
     """Refuse elements of xacro, and its expressions but in the parts of other programs."""
     for part in root:
         for element in part.iter():
             tag = _tag(element)
+            without_prefix = tag in OF_XACRO and element is part
+            with_prefix = ":" in tag and "xacro" in element.tag
             found = ""
-            if (tag in OF_XACRO and element is part) or (":" in tag and "xacro" in element.tag):
+            if without_prefix or with_prefix:
                 found = f"<{tag}>"
             elif _tag(part) not in OF_OTHERS:
-                found = "".join(
-                    EXPRESSION.findall(" ".join((*element.attrib.values(), element.text or "")))
-                )
+                texts = (*element.attrib.values(), element.text or "")
+                found = "".join(EXPRESSION.findall(" ".join(texts)))
             if found:
                 raise ValueError(f"{found} in line {element.sourceline} is xacro: {RUN_XACRO}")
 
 
-def _copy_robot(root: Any, passed: dict[str, None]) -> ET.Element:  # noqa: ANN401
+def _copy_robot(root: Element, passed: dict[str, None]) -> ET.Element:
     """Return a robot with the parts that an arm needs."""
     if not root.get("name"):
         raise ValueError("<robot> has no name")
@@ -220,7 +231,7 @@ def _copy_robot(root: Any, passed: dict[str, None]) -> ET.Element:  # noqa: ANN4
     return robot
 
 
-def _copy(source: Any, place: str, passed: dict[str, None]) -> ET.Element:  # noqa: ANN401
+def _copy(source: Element, place: str, passed: dict[str, None]) -> ET.Element:
     """Return an element with the parts that an arm needs.
 
     Args:
@@ -257,7 +268,7 @@ def _copy(source: Any, place: str, passed: dict[str, None]) -> ET.Element:  # no
     return copy
 
 
-def _copy_part(part: Any, copy: ET.Element, place: str, passed: dict[str, None]) -> None:  # noqa: ANN401
+def _copy_part(part: Element, copy: ET.Element, place: str, passed: dict[str, None]) -> None:
     """Append a part of an element, as far as an arm needs it, to the element's copy."""
     tag = _tag(part)
     known = CHILDREN.get(copy.tag, ())
@@ -278,7 +289,7 @@ def _copy_part(part: Any, copy: ET.Element, place: str, passed: dict[str, None])
             copy.append(own)
 
 
-def _attribute_matters(element: Any, name: str, text: str) -> bool:  # noqa: ANN401
+def _attribute_matters(element: Element, name: str, text: str) -> bool:
     """Return whether an unknown attribute of an element may carry geometry."""
     tag = _tag(element)
     if ":" in name:
@@ -292,41 +303,61 @@ def _attribute_matters(element: Any, name: str, text: str) -> bool:  # noqa: ANN
     return tag in GEOMETRY
 
 
-def _element_matters(parent: str, part: Any) -> bool:  # noqa: ANN401
+def _element_matters(parent: str, part: Element) -> bool:
     """Return whether an unknown element in another one may carry geometry."""
     tag = _tag(part)
-    if ":" in tag or parent not in SIMILAR:
-        return parent in GEOMETRY + ENDS and ":" not in tag
-    texts = [text for each in part.iter() for text in (*each.attrib.values(), each.text or "")]
-    return _is_like(tag, SIMILAR[parent]) or (parent == "joint" and any(map(_is_vector, texts)))
+    if ":" in tag:
+        return False
+    if parent not in SIMILAR:
+        return parent in GEOMETRY + ENDS
+    if _is_like(tag, SIMILAR[parent]):
+        return True
+    return parent == "joint" and _holds_vector(part)
+
+
+def _holds_vector(part: Element) -> bool:
+    """Return whether an attribute or a text of an element, or of one in it, is a vector."""
+    for element in part.iter():
+        texts = (*element.attrib.values(), element.text or "")
+        if any(map(_is_vector, texts)):
+            return True
+    return False
 
 
 def _is_like(word: str, words: Iterable[str]) -> bool:
     """Return whether a word is one of others misspelt, or has a geometric one of them in it."""
     lower = word.lower()
-    contained = any(each in lower for each in words if each in GEOMETRY)
-    return contained or bool(difflib.get_close_matches(lower, words, n=1, cutoff=LIKENESS))
+    if any(each in lower for each in words if each in GEOMETRY):
+        return True
+    close = difflib.get_close_matches(lower, words, n=1, cutoff=LIKENESS)
+    return bool(close)
 
 
 def _is_vector(text: str) -> bool:
     """Return whether a text is three numbers or more, not all of them zero."""
     words = text.replace(",", " ").split()
-    return len(words) >= 3 and all(map(NUMBER.fullmatch, words)) and not ZEROS.fullmatch(text)
+    are_numbers = len(words) >= 3 and all(map(NUMBER.fullmatch, words))
+    return are_numbers and not ZEROS.fullmatch(text)
 
 
 def _check_numbers(what: str, text: str, count: int, *, infinite: bool) -> None:
     """Refuse a text of another count of numbers, and words that are none; a count of 0 is any text."""
-    words = text.split()
     if count == 0:
         return
+    words = text.split()
     for word in words:
-        if not NUMBER.fullmatch(word) or (not infinite and not isfinite(float(word))):
-            if infinite and INFINITE.fullmatch(word):
-                continue
+        if not _is_number(word, infinite=infinite):
             remedy = next((f"; {remedy}" for fault, remedy in REMEDIES if fault.search(word)), "")
             raise ValueError(f"{what} has {word!r}, which is no number{remedy}")
     if len(words) != count:
         raise ValueError(f"{what}: the count of numbers must be {count}, got {text!r}")
+
+
+def _is_number(word: str, *, infinite: bool) -> bool:
+    """Return whether a word is a number; one that may be infinite can be so by its size or by its name."""
+    if infinite:
+        return bool(NUMBER.fullmatch(word) or INFINITE.fullmatch(word))
+    return bool(NUMBER.fullmatch(word)) and isfinite(float(word))
 
 
 def _turn_by_quaternion(origin: ET.Element, place: str) -> None:
@@ -336,10 +367,9 @@ def _turn_by_quaternion(origin: ET.Element, place: str) -> None:
     quaternion = [float(word) for word in origin.attrib.pop("quat_xyzw").split()]
     if "rpy" in origin.attrib:
         raise ValueError(f"{place}: origin has both rpy and quat_xyzw; keep one")
-    if abs(hypot(*quaternion) - 1.0) > ROUNDED_UNIT:
-        raise ValueError(
-            f"{place}: origin quat_xyzw must have a norm of 1, got {hypot(*quaternion):.3g}"
-        )
+    norm = hypot(*quaternion)
+    if abs(norm - 1.0) > ROUNDED_UNIT:
+        raise ValueError(f"{place}: origin quat_xyzw must have a norm of 1, got {norm:.3g}")
     rpy = rpy_from_rotation(Rotation.from_quat(quaternion).as_matrix())
     origin.set("rpy", " ".join(map(repr, rpy.tolist())))
 
@@ -351,7 +381,10 @@ def _check_joint(joint: ET.Element, place: str) -> None:
         raise ValueError(f"{place} has the type {kind!r}; {suggest(kind, TYPES)}")
     for tag, name in REQUIRED.items():
         part = joint.find(tag)
-        if tag in ENDS and part is None:
-            raise ValueError(f"{place} has no <{tag}>")
-        if part is not None and not part.get(name) and (kind != "fixed" or tag in ENDS):
+        if part is None:
+            if tag in ENDS:
+                raise ValueError(f"{place} has no <{tag}>")
+            continue
+        is_needed = kind != "fixed" or tag in ENDS
+        if is_needed and not part.get(name):
             raise ValueError(f"{place}: {tag} has no {name}")

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from math import inf, isfinite, pi
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -14,8 +14,8 @@ from servobench.plant.contract.settings import Check, Number, Positive, read_val
 from servobench.plant.robot.arm import JointLimits, SerialArm, rpy_from_rotation
 from servobench.plant.robot.files import Mass
 from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
-from servobench.plant.robot.urdf_chain import Chain, Joint, find_chain, pose_of
-from servobench.plant.robot.urdf_elements import read_elements
+from servobench.plant.robot.urdf_chain import Chain, Joint, JointElement, find_chain, pose_of
+from servobench.plant.robot.urdf_elements import Tree, read_elements
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
 LIMITS: Final = Check.of(tuple[Annotated[Number, Ge(-30.0), Le(30.0)], ...], bare=True)
@@ -24,21 +24,20 @@ MASS: Final = Check.of(Mass, bare=True)
 USUAL_LIMIT: Final = 4.0 * pi  # [rad]
 USUAL_SPEEDS: Final = (0.01, 20.0)  # [rad/s]
 UNLIMITED: Final = 1e3  # [rad], [rad/s] from which on a limit is none
-DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side of a joint whose limit is not given
-DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
+DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side, where a joint's limit is not given
+DEFAULT_SPEED: Final = pi  # [rad/s] where a joint's limit is not given
 DEFAULTS: Final = "±2π rad and π rad/s"
-INERTIA_MARGIN: Final = (
-    1e-6  # [1] of the largest moment, by which the others' sum is above it despite rounding
-)
-ROUNDED_INERTIA: Final = (
-    5e-3  # [1] of the largest moment, by which it exceeds the others' sum without a remark
-)
-FLAT_INERTIA: Final = (
-    0.9  # [1] of the largest moment, by which it exceeds the others' sum in no real file
-)
-# [1] radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
-MAX_GYRATION: Final = 2.0 / 3.0
-MAX_DENSITY: Final = 22_600.0  # [kg/m³] of osmium, whose sphere has the least inertia of a mass
+# Shares of a link's largest principal moment:
+# by which the others' sum is above it despite rounding,
+INERTIA_MARGIN: Final = 1e-6  # [1]
+# by which it may exceed the others' sum without a remark,
+ROUNDED_INERTIA: Final = 5e-3  # [1]
+# and by which it exceeds the others' sum in no real file.
+FLAT_INERTIA: Final = 0.9  # [1]
+# Largest radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
+MAX_GYRATION: Final = 2.0 / 3.0  # [1]
+# Density of osmium, whose sphere has the least inertia of a mass
+MAX_DENSITY: Final = 22_600.0  # [kg/m³]
 
 
 def read_urdf_robot(path: Path, tip: str) -> Robot:
@@ -71,9 +70,16 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
     names = arm.joint_names
     line = f"{path.name}: {arm.n} joints from {names[0]} to {names[-1]}, the ball on {chain.tip}"
     lines = [each for each in (line, chain.ending, note) if each]
-    title = str(tree.name)
     return Robot(
-        path.stem, title, path.name, arm, limits, links, workspace, note="; ".join(lines), flaw=flaw
+        name=path.stem,
+        title=str(tree.name),
+        source=path.name,
+        arm=arm,
+        limits=limits,
+        links=links,
+        workspace=workspace,
+        note="; ".join(lines),
+        flaw=flaw,
     )
 
 
@@ -82,82 +88,92 @@ def _arm(chain: Chain) -> SerialArm:
     names = tuple(link.joint.name for link in chain.joints)
     n = len(names)
     origins = np.stack([*(link.origin for link in chain.joints), chain.flange])
-    rpy = rpy_from_rotation(origins[:, :3, :3])
-    return with_ball(SerialArm(names, origins[:, :3, 3], rpy, np.zeros(n), np.ones(n), np.zeros(3)))
+    arm = SerialArm(
+        joint_names=names,
+        translation=origins[:, :3, 3],
+        rpy=rpy_from_rotation(origins[:, :3, :3]),
+        joint_offset=np.zeros(n),
+        gear_ratio=np.ones(n),
+        tool=np.zeros(3),
+    )
+    return with_ball(arm)
 
 
-def _limits(joints: list[Any]) -> JointLimits:
+def _limits(joints: list[JointElement]) -> JointLimits:
     """Return the limits; soft limits of a safety controller count where they are narrower."""
-    told = defaultdict[str, list[str]](list)  # remark -> limits or joints
+    remarks = defaultdict[str, list[str]](list)  # remark -> limits or joints
     rows = []
     for joint in joints:
         name = f"joint {joint.name!r}"
-        lower, upper = -DEFAULT_RANGE, DEFAULT_RANGE
-        if joint.type != "continuous":
-            lower = _limit(joint, "lower", lower, told)
-            upper = _limit(joint, "upper", upper, told)
-            safety = joint.safety_controller
-            if safety is not None and safety.soft_lower_limit is not None:
-                lower = max(lower, safety.soft_lower_limit)
-            if safety is not None and safety.soft_upper_limit is not None:
-                upper = min(upper, safety.soft_upper_limit)
-        speed = _limit(joint, "velocity", DEFAULT_SPEED, told)
+        lower, upper = _range(joint, remarks)
+        speed = _limit(joint, "velocity", DEFAULT_SPEED, remarks)
         read_value(f"{name}: limits", (float(lower), float(upper)), LIMITS, lambda: "rad")
         read_value(f"{name}: velocity", (float(speed),), SPEEDS, lambda: "rad/s")
         if lower >= upper:
             raise ValueError(f"{name}: lower must be below upper, got {lower:g} and {upper:g}")
         if max(-lower, upper) > USUAL_LIMIT:
-            told["limits beyond ±4π rad; angles of a URDF are in rad"].append(joint.name)
-        if not USUAL_SPEEDS[0] <= speed <= USUAL_SPEEDS[1]:
-            told[
-                "velocities that are usually from 0.01 to 20 rad/s; those of a URDF are in rad/s"
-            ].append(joint.name)
+            remarks["limits beyond ±4π rad; angles of a URDF are in rad"].append(joint.name)
+        slowest, fastest = USUAL_SPEEDS
+        if not slowest <= speed <= fastest:
+            usual = "velocities that are usually from 0.01 to 20 rad/s"
+            remarks[f"{usual}; those of a URDF are in rad/s"].append(joint.name)
         rows.append((lower, upper, speed))
-    for text, names in told.items():
+    for text, names in remarks.items():
         remark(f"{text}: {', '.join(names)}")
     lowers, uppers, speeds = np.array(rows, dtype=np.float64).T
     return JointLimits(lowers, uppers, speeds)
 
 
-def _limit(joint: Any, word: str, default: float, told: dict[str, list[str]]) -> float:  # noqa: ANN401
+def _range(joint: JointElement, remarks: dict[str, list[str]]) -> tuple[float, float]:
+    """Return the lower and the upper limit of a joint [rad]."""
+    if joint.type == "continuous":
+        return -DEFAULT_RANGE, DEFAULT_RANGE
+    lower = _limit(joint, "lower", -DEFAULT_RANGE, remarks)
+    upper = _limit(joint, "upper", DEFAULT_RANGE, remarks)
+    safety = joint.safety_controller
+    if safety is not None and safety.soft_lower_limit is not None:
+        lower = max(lower, safety.soft_lower_limit)
+    if safety is not None and safety.soft_upper_limit is not None:
+        upper = min(upper, safety.soft_upper_limit)
+    return lower, upper
+
+
+def _limit(joint: JointElement, word: str, default: float, remarks: dict[str, list[str]]) -> float:
     """Return a limit of a joint; the default where it is not given or infinite."""
     given = getattr(joint.limit, word, None)
+    limit = f"{word} of {joint.name}"
     if given is None or (given == 0.0 and word == "velocity"):
-        told[f"limits that the URDF lacks are taken as {DEFAULTS}"].append(
-            f"{word} of {joint.name}"
-        )
+        remarks[f"limits that the URDF lacks are taken as {DEFAULTS}"].append(limit)
         return default
     if abs(given) == inf or (abs(given) >= UNLIMITED and word != "velocity"):
-        told[f"unlimited in the URDF, and taken as {DEFAULTS}"].append(f"{word} of {joint.name}")
+        remarks[f"unlimited in the URDF, and taken as {DEFAULTS}"].append(limit)
         return default
     return float(given)
 
 
-def _links(tree: Any, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> tuple[Links, str]:  # noqa: ANN401
+def _links(tree: Tree, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> tuple[Links, str]:
     """Return the links, estimated where the file has no values, and a line about the estimates.
 
     Args:
         tree: the file.
         chain: the joints.
-        arm: of these joints.
+        arm: the arm of these joints.
         flaws: takes values that no body has.
     """
     inertials = {link.name: link.inertial for link in tree.links}
-    own = [inertials[link.joint.child] for link in chain]
-    efforts = [getattr(link.joint.limit, "effort", None) or 0.0 for link in chain]
-    torque = None
-    if all(isfinite(effort) and effort > 0.0 for effort in efforts):
-        torque = np.array(efforts)
-    given = [
-        inertial is not None and inertial.mass and np.any(inertial.inertia) for inertial in own
-    ]
-    if not all(given):
-        further = "" if torque is not None else ", torque limits"
-        lacking = ", ".join(
-            link.joint.child for link, known in zip(chain, given, strict=True) if not known
-        )
-        cause = f" (no mass or inertia of {lacking})" if any(given) else ""
-        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}{cause}"
+    torque = _torque_limits(chain)
+    lacking = []
+    for link in chain:
+        own = inertials[link.joint.child]
+        if own is None or not own.mass or not np.any(own.inertia):
+            lacking.append(link.joint.child)
+    if lacking:
+        estimated = "masses, inertia"
+        if torque is None:
+            estimated += ", torque limits"
+        if len(lacking) < len(chain):
+            estimated += f" (no mass or inertia of {', '.join(lacking)})"
+        return estimate_links(arm, torque=torque), f"estimated: {estimated}"
     reach = float(np.linalg.norm(arm.translation[1:], axis=1).sum())
     bodies = [_body(tree, chain, link, reach, flaws) for link in chain]
     mass, centre, inertia = (np.array(each) for each in zip(*bodies, strict=True))
@@ -165,60 +181,87 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> t
     return links, "" if torque is not None else "estimated: torque limits"
 
 
+def _torque_limits(chain: list[Joint]) -> FloatArray | None:
+    """Return the largest torques of the joints, (n,) Nm; None where the file lacks one."""
+    efforts = []
+    for link in chain:
+        effort = getattr(link.joint.limit, "effort", None) or 0.0
+        if not isfinite(effort) or effort <= 0.0:
+            return None
+        efforts.append(effort)
+    return np.array(efforts)
+
+
+class Body(NamedTuple):
+    """The inertial values of a link in the frame of the joint before it."""
+
+    link: str
+    mass: float  # [kg]
+    centre: FloatArray  # (3,) [m]
+    inertia: FloatArray  # (3, 3) [kg m²], about the centre
+
+
 def _body(
-    tree: Any,  # noqa: ANN401
-    chain: list[Joint],
-    link: Joint,
-    reach: float,
-    flaws: list[str],
+    tree: Tree, chain: list[Joint], link: Joint, reach: float, flaws: list[str]
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return mass [kg], centre (3,) [m] and inertia (3, 3) [kg m²] of a link and of all that hangs on it.
 
     These are links behind fixed joints, such as a tool, and behind joints that no controller moves, such as fingers.
     """
+    bodies = _hanging_bodies(tree, chain, link, reach, flaws)
+    mass = sum(body.mass for body in bodies)
+    moments = [body.mass * body.centre for body in bodies]
+    centre = np.sum(moments, axis=0) / mass
+    inertia = np.zeros((3, 3))
+    for body in bodies:
+        # Parallel axes: I + m (‖r‖² 1 − r rᵀ)
+        r = body.centre - centre
+        inertia += body.inertia + body.mass * (r @ r * np.eye(3) - np.outer(r, r))
+    if not flaws:
+        culprit = max(bodies, key=lambda body: float(np.trace(body.inertia)))
+        flaws += _implausible(culprit.link, mass, inertia, reach)
+    return mass, centre, inertia
+
+
+def _hanging_bodies(
+    tree: Tree, chain: list[Joint], link: Joint, reach: float, flaws: list[str]
+) -> list[Body]:
+    """Return the bodies with a mass that move with the link behind a joint of the chain, that link's own first."""
     inertials = {each.name: each.inertial for each in tree.links}
     onward = {each.joint.name for each in chain}
     waiting = [(link.joint.child, link.aligned.T)]
     met = set[str]()
-    parts = list[tuple[str, float, FloatArray, FloatArray]]()
+    bodies = []
     while waiting:
         name, pose = waiting.pop()
         met.add(name)
-        waiting += [
-            (joint.child, pose @ pose_of(joint.origin))
-            for joint in tree.joints
-            if joint.parent == name and joint.name not in onward and joint.child not in met
-        ]
+        for joint in tree.joints:
+            hangs_on_it = joint.parent == name and joint.name not in onward
+            if hangs_on_it and joint.child not in met:
+                waiting.append((joint.child, pose @ pose_of(joint.origin)))
         own = inertials[name]
         if own is not None and own.mass:
-            read_value(f"link {name!r}: mass", float(own.mass), MASS, lambda: "kg")
+            mass = float(own.mass)
+            read_value(f"link {name!r}: mass", mass, MASS, lambda: "kg")
             placed = pose @ pose_of(own.origin)
             R = placed[:3, :3]
             inertia = np.zeros((3, 3))
             if np.any(own.inertia):
                 inertia = _balanced(name, own.inertia, flaws)
-            parts.append((name, float(own.mass), placed[:3, 3], R @ inertia @ R.T))
+            bodies.append(Body(name, mass, placed[:3, 3], R @ inertia @ R.T))
             away = float(np.linalg.norm(placed[:3, 3]))
             if away > reach:
                 flaws.append(
                     f"link {name!r}: its centre of mass is {away:.3g} m from joint {link.joint.name!r}"
                 )
-    mass = sum(each for _, each, _, _ in parts)
-    centre = np.sum([each * place for _, each, place, _ in parts], axis=0) / mass
-    whole = np.zeros((3, 3))
-    for _, each, place, inertia in parts:
-        off = place - centre
-        whole += inertia + each * (off @ off * np.eye(3) - np.outer(off, off))
-    if not flaws:
-        culprit = max(parts, key=lambda part: float(np.trace(part[3])))
-        flaws += _implausible(culprit[0], mass, whole, reach)
-    return mass, centre, whole
+    return bodies
 
 
 def _implausible(link: str, mass: float, inertia: FloatArray, reach: float) -> list[str]:
     """Return why no link of an arm of length `reach` [m] has this mass [kg] and inertia (3, 3) [kg m²]."""
     largest = float(np.linalg.eigvalsh(inertia)[-1])
     most = mass * (MAX_GYRATION * reach) ** 2
+    # The smallest body is a sphere: m = 4/3 π r³ ρ, with the moment 2/5 m r².
     radius = (3.0 * mass / (4.0 * pi * MAX_DENSITY)) ** (1.0 / 3.0)
     least = 0.4 * mass * radius**2
     if least <= largest <= most:
@@ -247,6 +290,7 @@ def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
         return inertia
     if excess > FLAT_INERTIA * moments[2]:
         flaws.append(f"link {link!r}: no body has the {came}, one far above the others' sum")
+    # The nearest moments without excess: each gives the same share of it.
     moments = moments + excess / (3.0 + INERTIA_MARGIN) * np.array([1.0, 1.0, -1.0])
     if excess > ROUNDED_INERTIA * moments[2]:
         taken = ", ".join(f"{moment:.3g}" for moment in moments)
