@@ -108,7 +108,7 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
     rate_a = across / depth[..., None]
     if optics.further is not None:
         slope = _distortion_slope(a, optics.distortion, optics.further)
-        return np.asarray(optics.focal_lengths[..., None, :, None] * (slope @ rate_a))
+        return optics.focal_lengths[..., None, :, None] * (slope @ rate_a)
     # ∂((1 + k r²) a) = ∂a + k (r² ∂a + 2 a aᵀ ∂a)
     k = optics.distortion[..., None, None, None]
     square = np.vecdot(a, a)[..., None, None]
@@ -147,7 +147,7 @@ def _undistorted(b: FloatArray, optics: Optics) -> FloatArray:
 
 def _with_length(b: FloatArray, r: FloatArray, length: FloatArray) -> FloatArray:
     """Return vectors along `b` (..., 2), whose length is given, with the length r, (..., 2)."""
-    return np.asarray(b * (r / np.maximum(length, 1e-12))[..., None])
+    return b * (r / np.maximum(length, 1e-12))[..., None]
 
 
 def _undistorted_quadratic(b: FloatArray, k: FloatArray) -> FloatArray:
@@ -250,7 +250,7 @@ def _undistorted_polynomial(b: FloatArray, k1: FloatArray, further: FloatArray) 
         a = a - adjugate_e / determinant[..., None]
         shrink = np.minimum(1.0, most / np.maximum(norm(a), 1e-12))
         a = a * shrink[..., None]
-    return np.asarray(a)
+    return a
 
 
 def _undistorted_radially(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
@@ -300,7 +300,7 @@ def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArra
     if turning is not None:
         a = points[..., :2] / _depth(points)
         inside &= np.vecdot(a, a) <= turning[..., None]
-    return np.asarray(inside & (points[..., 2] > NEAR))
+    return inside & (points[..., 2] > NEAR)
 
 
 def _depth(points: FloatArray) -> FloatArray:

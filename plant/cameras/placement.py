@@ -86,11 +86,11 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
 def _no_draws(count: int) -> CameraDraws:
     """Return the values of `count` cameras that are as planned."""
     return CameraDraws(
-        focal=np.ones(count),
-        centre=np.zeros((count, 2)),
-        distortion=np.zeros(count),
-        turn=np.zeros((count, 3)),
-        mount=np.zeros((count, 3)),
+        np.ones(count),
+        np.zeros((count, 2)),
+        np.zeros(count),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
     )
 
 
@@ -102,7 +102,7 @@ def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
     share = 1.0
     if not mismatch.camera_exact:
         share = named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
-    return np.asarray(share * angle * axis)
+    return share * angle * axis
 
 
 @lru_cache(maxsize=64)
@@ -265,13 +265,13 @@ def _model(
     else:
         target, distance = _target_in_world(setup, robot)
     return SetupModel(
-        arm=arm,
-        setup=setup,
-        mount=mount,
-        cameras=cameras,
-        optics=_optics(setup, robot, draws),
-        target=target,
-        distance=distance,
+        arm,
+        setup,
+        mount,
+        cameras,
+        _optics(setup, robot, draws),
+        target,
+        distance,
         planned=robot.pinhole,
         far=robot.workspace.camera_distance,
     )
@@ -334,22 +334,13 @@ def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:
         centre = K[:, :2, 2]
         distortion = np.array([each.distortion[0] for each in own]) + draws.distortion
         further = _further(own, distortion)
-        if _is_plain(further):
+        # Square pixels and k₁ alone need no further numbers.
+        is_usual = further.shape[1] == COLUMNS["plumb_bob"]
+        if is_usual and (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all():
             further = None
-    return Optics(
-        focal=focal * draws.focal,
-        centre=centre + draws.centre,
-        distortion=distortion,
-        size=planned.size,
-        further=further,
-    )
-
-
-def _is_plain(further: FloatArray) -> bool:
-    """Return whether further numbers of cameras, (c, k), are those of square pixels and of k₁ alone."""
-    if further.shape[1] != COLUMNS["plumb_bob"]:
-        return False
-    return bool((further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all())
+    focal = focal * draws.focal
+    centre = centre + draws.centre
+    return Optics(focal, centre, distortion, planned.size, further)
 
 
 def _further(own: Sequence[OwnCamera], distortion: FloatArray) -> FloatArray:

@@ -261,12 +261,12 @@ in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, 
 HALF_SIDE: Final = 0.12  # [m]
 
 POSITION = SensingSetup(
-    name="position",
-    summary="the ball in 3-D, by a camera with depth",
-    features=("x", "y", "z"),
-    unit="m",
-    measure=position,
-    rates=position_rates,
+    "position",
+    "the ball in 3-D, by a camera with depth",
+    ("x", "y", "z"),
+    "m",
+    position,
+    position_rates,
 )
 PIXEL = in_pixels("pixel", "the ball in the image of one camera", ("u", "v"))
 STEREO = in_pixels(
@@ -363,7 +363,7 @@ class SetupModel(RobotModel):
             return np.asarray(centre, dtype=np.float64)
         position = self.camera[..., :3, 3]
         optical_axis = self.camera[..., :3, 2]
-        return np.asarray(position + self.distance * optical_axis)
+        return position + self.distance * optical_axis
 
     def points(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the target in the frame that the cameras are mounted on, (..., p, 3) m."""

@@ -40,10 +40,10 @@ class ArmGeometry(NamedTuple):
     def of(cls, arm: SerialArm) -> Self:
         """Return the geometry of `arm` as constants."""
         return cls(
-            translation=casadi.SX(arm.translation),
-            rpy=casadi.SX(arm.rpy),
-            joint_offset=casadi.SX(arm.joint_offset),
-            gear_ratio=casadi.SX(arm.gear_ratio),
+            casadi.SX(arm.translation),
+            casadi.SX(arm.rpy),
+            casadi.SX(arm.joint_offset),
+            casadi.SX(arm.gear_ratio),
         )
 
 

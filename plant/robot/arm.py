@@ -25,6 +25,17 @@ YZX = np.array([1, 2, 0])
 ZXY = np.array([2, 0, 1])
 
 
+def freeze_arrays(owner: object, shape: tuple[int, ...], *names: str) -> None:
+    """Check that fields of a frozen dataclass are arrays of a shape, and make them read-only.
+
+    Raises:
+        ValueError: a field with another shape, or with a number that is not finite.
+    """
+    for name in names:
+        array = as_array(name, getattr(owner, name), shape)
+        object.__setattr__(owner, name, array)
+
+
 def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
     """Return Rz(yaw) Ry(pitch) Rx(roll), shape (..., 3, 3), for `rpy` of shape (..., 3) in rad."""
     angles = np.asarray(rpy, dtype=np.float64)
@@ -72,18 +83,10 @@ class SerialArm:
 
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
-        n = self.n
         lead = np.shape(self.translation)[:-2]
-        shapes = {
-            "translation": (n + 1, 3),
-            "rpy": (n + 1, 3),
-            "joint_offset": (n,),
-            "gear_ratio": (n,),
-            "tool": (3,),
-        }
-        for name, shape in shapes.items():
-            array = as_array(name, getattr(self, name), lead + shape)
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, (*lead, self.n + 1, 3), "translation", "rpy")
+        freeze_arrays(self, (*lead, self.n), "joint_offset", "gear_ratio")
+        freeze_arrays(self, (*lead, 3), "tool")
 
     @property
     def n(self) -> int:
@@ -161,7 +164,7 @@ class SerialArm:
         motions = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
         motions -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
         motions *= self.gear_ratio[..., None, :, None]
-        return np.asarray(motions)
+        return motions
 
     def ball(self, frames: FloatArray) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for `frames`."""
@@ -232,10 +235,7 @@ class JointLimits:
 
     def __post_init__(self) -> None:
         """Check order and signs and freeze the arrays."""
-        n = len(self.lower)
-        for name in ("lower", "upper", "speed"):
-            array = as_array(name, getattr(self, name), (n,))
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, (len(self.lower),), "lower", "upper", "speed")
         if not (self.lower < self.upper).all():
             came = f"{self.lower.tolist()} and {self.upper.tolist()}"
             raise ValueError(f"joint_lower must be below joint_upper for every joint, got {came}")
@@ -252,7 +252,7 @@ def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float
     if limits is None:
         return JointLimits(np.full(n, -reach), np.full(n, reach), np.full(n, speed))
     return JointLimits(
-        lower=limits.lower.clip(-reach),
-        upper=limits.upper.clip(max=reach),
-        speed=limits.speed.clip(max=speed),
+        limits.lower.clip(-reach),
+        limits.upper.clip(max=reach),
+        limits.speed.clip(max=speed),
     )

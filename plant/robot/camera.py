@@ -63,7 +63,7 @@ class PinholeCamera:
         p = np.asarray(p_C, dtype=np.float64)
         offset_u, offset_v = PIXEL_CENTRE
         middle = (self.width / 2 - offset_u, self.height / 2 - offset_v)
-        return np.asarray(self.focal * p[..., :2] / p[..., 2:] + middle)
+        return self.focal * p[..., :2] / p[..., 2:] + middle
 
     def rays(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> FloatArray:
         """Return the rays (x/z, y/z, 1) through pixels.

@@ -33,29 +33,40 @@ from servobench.plant.contract.settings import (
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.camera_formats import LENSES, in_rows, plain_name, read_intrinsics
 
-SYNONYMS: Final[
-    Mapping[str, str]
-] = {  # names without capitals, blanks, hyphens and underscores -> that of ROS
-    **dict.fromkeys(
-        ("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "plumb_bob"
+# ROS's name of a model -> its names without capitals, blanks, hyphens and underscores
+LENS_NAMES: Final[Mapping[str, tuple[str, ...]]] = {
+    "plumb_bob": ("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"),
+    "rational_polynomial": ("rationalpolynomial", "rational", "rationalmodel", "fullopencv"),
+    "equidistant": (
+        "equidistant",
+        "equi",
+        "fisheye",
+        "opencvfisheye",
+        "kb",
+        "kb4",
+        "kb8",
+        "kannalabrandt",
+        "kannalabrandt4",
+        "kannalabrandt8",
     ),
-    **dict.fromkeys(
-        ("rationalpolynomial", "rational", "rationalmodel", "fullopencv"), "rational_polynomial"
-    ),
-    **dict.fromkeys(
-        ("equidistant", "equi", "fisheye", "opencvfisheye", "kb", "kb4", "kb8"), "equidistant"
-    ),
-    **dict.fromkeys(("kannalabrandt", "kannalabrandt4", "kannalabrandt8"), "equidistant"),
-    **dict.fromkeys(("", "opencv"), ""),
-    **dict.fromkeys(
-        ("none", "null", "no", "nodistortion", "undistorted", "rectified", "ideal"), "none"
-    ),
-    **dict.fromkeys(
-        ("pinhole", "perspective", "inversebrownconrady", "modifiedbrownconrady"), "none"
+    "": ("", "opencv"),
+    "none": (
+        "none",
+        "null",
+        "no",
+        "nodistortion",
+        "undistorted",
+        "rectified",
+        "ideal",
+        "pinhole",
+        "perspective",
+        "inversebrownconrady",
+        "modifiedbrownconrady",
     ),
 }
+SYNONYMS: Final = {name: lens for lens, names in LENS_NAMES.items() for name in names}
 WANTED: Final = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
-RANGES: Final = {  # of numbers: unit, least and largest
+RANGES: Final = {  # unit, least and largest number
     "width": ("px", 16, 20_000), "height": ("px", 16, 20_000), "vertical_fov": ("deg", 2, 170),
     "rate": ("Hz", 0.5, 1000), "latency": ("s", 0, 5),
 }  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 from servobench.plant.contract.files import accessing, divisions, is_file, read_toml, user_path
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
+from servobench.plant.robot.arm import SerialArm, arm_from_dh, narrow_limits
 from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
@@ -215,27 +215,15 @@ def random_robot(number: int) -> Robot:
     generator = named_generator(number, RANDOM_ARM)
     n = int(generator.integers(MIN_JOINTS, MAX_JOINTS + 1))
     name = f"{RANDOM_ARM}_{number}"
-    limits = JointLimits(
-        lower=np.full(n, -JOINT_RANGE),
-        upper=np.full(n, JOINT_RANGE),
-        speed=np.full(n, JOINT_SPEED),
-    )
+    limits = narrow_limits(None, n, JOINT_SPEED, JOINT_RANGE)
     for _ in range(MAX_DRAWS):
         arm = _draw_arm(n, generator)
         links = estimate_links(arm)
         workspace = search_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
         if workspace is not None:
-            return Robot(
-                name=name,
-                title=name,
-                source=f"drawn from the number {number}",
-                arm=arm,
-                limits=limits,
-                links=links,
-                workspace=workspace,
-                note=f"{name} has {n} joints",
-                known=False,
-            )
+            source = f"drawn from the number {number}"
+            note = f"{name} has {n} joints"
+            return Robot(name, name, source, arm, limits, links, workspace, note=note, known=False)
     raise ValueError(
         f"none of {MAX_DRAWS} arms drawn for {name} can work at the bench; take another number"
     )

@@ -118,9 +118,9 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
         arm = with_ball(_arm_of(table))
         n = arm.n
         limits = JointLimits(
-            lower=as_array("joint_lower", table.joint_lower, (n,)),
-            upper=as_array("joint_upper", table.joint_upper, (n,)),
-            speed=as_array("joint_speed", table.joint_speed, (n,)),
+            as_array("joint_lower", table.joint_lower, (n,)),
+            as_array("joint_upper", table.joint_upper, (n,)),
+            as_array("joint_speed", table.joint_speed, (n,)),
         )
         mass = as_array("mass", table.mass, (n,)) if table.mass else None
         torque = as_array("torque", table.torque, (n,)) if table.torque else None

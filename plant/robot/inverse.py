@@ -13,7 +13,6 @@ The pose of the flange, from one start, with the geometric Jacobian J (6×n) and
     Δq = Jᵀ (J Jᵀ + λ I)⁻¹ [ℓ⁻¹ (p* − p); log(R* Rᵀ)],        q ← clip(q + Δq, lower, upper)   if the error shrinks
 """
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -21,7 +20,6 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, plus_diagonal, take
-from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
 
 STARTS: Final = 16
@@ -59,12 +57,7 @@ def closest_distance(
     drawn = np.random.default_rng(0).uniform(*within_turn, (STARTS, n))
     drawn = drawn.reshape(STARTS, *(1,) * len(lead), n)
     starts = np.broadcast_to(drawn, (STARTS, *lead, n))
-
-    def is_reached(distance: FloatArray) -> BoolArray:
-        """One start that reaches a point ends the search for it from all starts."""
-        return np.asarray(distance.min(axis=0) <= CLOSE_ENOUGH)
-
-    _, distance = _search(arm, target, starts, (low, high), is_reached)
+    _, distance = _search(arm, target, starts, (low, high), one_is_enough=True)
     return np.asarray(distance.min(axis=0))
 
 
@@ -83,13 +76,8 @@ def reach_for(
     Returns:
         Joint positions (k, n) [rad], and how far the ball is from the point (k,) [m].
     """
-
-    def is_reached(distance: FloatArray) -> BoolArray:
-        """The search from a start ends for itself, also where its distance is no number."""
-        return ~(distance > CLOSE_ENOUGH)
-
     target = np.broadcast_to(point, (len(starts), 3))
-    return _search(arm, target, starts, (lower, upper), is_reached)
+    return _search(arm, target, starts, (lower, upper), one_is_enough=False)
 
 
 def _search(
@@ -97,11 +85,13 @@ def _search(
     target: FloatArray,
     q: FloatArray,
     limits: Limits,
-    is_reached: Callable[[FloatArray], BoolArray],
+    *,
+    one_is_enough: bool,
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint positions (starts, ..., n) rad near targets (..., 3) m, and their distances from it (starts, ...) m.
 
-    The search begins at `q`, (starts, ..., n) rad, and ends for those whose distances `is_reached` accepts.
+    The search begins at `q`, (starts, ..., n) rad. It ends for each start by itself that reaches its target, or with
+    `one_is_enough` for a target from all starts as soon as one of them reaches it.
     """
     arm_axes = arm.translation.ndim - 2
     q = q.copy()
@@ -110,8 +100,10 @@ def _search(
     distance = norm(error)
     damping = np.full(q.shape[:-1], FIRST_DAMPING)
     for _ in range(ITERATIONS):
-        open_ones = np.broadcast_to(~is_reached(distance), distance.shape)
-        left = np.nonzero(open_ones)
+        is_open = distance > CLOSE_ENOUGH
+        if one_is_enough:
+            is_open = ~(distance.min(axis=0) <= CLOSE_ENOUGH)
+        left = np.nonzero(np.broadcast_to(is_open, distance.shape))
         if not left[0].size:
             break
         tried = _step(q[left], error[left], J[left], damping[left], *limits)

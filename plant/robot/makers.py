@@ -77,9 +77,9 @@ def universal_robot(title: str) -> Robot:
     """Return an arm of Universal Robots by its title, such as "UR10e"."""
     row = UNIVERSAL_ROBOTS[title]
     limits = JointLimits(
-        lower=np.full(6, -2 * pi),
-        upper=np.full(6, 2 * pi),
-        speed=np.radians(np.repeat(row.speed, ALIKE)),
+        np.full(6, -2 * pi),
+        np.full(6, 2 * pi),
+        np.radians(np.repeat(row.speed, ALIKE)),
     )
     if title == "UR5":
         return _ur5(row, limits)
@@ -89,13 +89,13 @@ def universal_robot(title: str) -> Robot:
     aside = scale * np.array(ur5.SIDE_STEP)
     mass = np.array(row.mass)
     links = Links(
-        mass=mass,
-        centre=np.array(row.centre),
-        inertia=cylinder_inertia(mass, radius, arm),
-        torque=np.repeat(row.torque, ALIKE),
-        radius=radius,
-        aside=aside,
-        payload=row.payload,
+        mass,
+        np.array(row.centre),
+        cylinder_inertia(mass, radius, arm),
+        np.repeat(row.torque, ALIKE),
+        radius,
+        aside,
+        row.payload,
     )
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
@@ -104,23 +104,23 @@ def universal_robot(title: str) -> Robot:
 def _ur5(row: UniversalRobot, limits: JointLimits) -> Robot:
     """Return the UR5, with the workspace of its sheet."""
     links = Links(
-        mass=np.array(ur5.MASS),
-        centre=np.array(ur5.CENTRE_OF_MASS),
-        inertia=np.array(ur5.INERTIA),
-        torque=np.array(ur5.MAX_TORQUE),
-        radius=np.array(ur5.TUBE_RADIUS),
-        aside=np.array(ur5.SIDE_STEP),
-        payload=row.payload,
+        ur5.MASS,
+        ur5.CENTRE_OF_MASS,
+        ur5.INERTIA,
+        ur5.MAX_TORQUE,
+        ur5.TUBE_RADIUS,
+        ur5.SIDE_STEP,
+        row.payload,
     )
     workspace = Workspace(
-        scale=1.0,
-        centre=np.array(CENTRE),
-        shoulder=np.array(ur5.SHOULDER),
-        home=np.array(ur5.HOME),
-        lower=np.array(ur5.TRAINING_LOWER),
-        upper=np.array(ur5.TRAINING_UPPER),
-        moves={name: (np.array(start), np.array(end)) for name, (start, end) in ur5.MOVES.items()},
-        stretched=np.array(ur5.STRETCHED),
+        1.0,
+        np.array(CENTRE),
+        ur5.SHOULDER,
+        ur5.HOME,
+        ur5.TRAINING_LOWER,
+        ur5.TRAINING_UPPER,
+        ur5.MOVES,
+        ur5.STRETCHED,
     )
     return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
 
@@ -131,27 +131,21 @@ def panda() -> Robot:
     facts = ur5.ARMS["panda"]
     joints = tuple(f"joint_{i}" for i in range(1, 8))
     arm = with_ball(arm_from_dh(facts["a"], facts["d"], facts["alpha"], joints, modified=True))
-    limits = JointLimits(
-        lower=np.array(facts["lower"]),
-        upper=np.array(facts["upper"]),
-        speed=np.array(facts["speed"]),
-    )
+    limits = JointLimits(facts["lower"], facts["upper"], facts["speed"])
     tensors = [
         [(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]
     ]
     centre, inertia = at_far_end(arm, np.array(facts["centre"]), np.array(tensors))
-    radius = np.array(facts["radius"])
-    aside = np.zeros(7)
     links = Links(
-        mass=np.array(facts["mass"]),
-        centre=centre,
-        inertia=inertia,
-        torque=np.array(facts["torque"]),
-        radius=radius,
-        aside=aside,
+        facts["mass"],
+        centre,
+        inertia,
+        facts["torque"],
+        facts["radius"],
+        np.zeros(7),
         payload=3.0,
     )
-    workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
+    workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
     return Robot("panda", "Panda", PANDA_SOURCE, arm, limits, links, workspace)
 
 
@@ -293,7 +287,7 @@ def nearest_lengths(arm: SerialArm) -> tuple[FloatArray, float]:
 def _flange_positions(arm: SerialArm) -> FloatArray:
     """Return the positions of the flange in a few postures, (k, 3) m."""
     postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, arm.n))
-    return np.asarray(arm.frames(postures)[:, -1, :3, 3])
+    return arm.frames(postures)[:, -1, :3, 3]
 
 
 def deviation_from(arm: SerialArm, title: str) -> float:

@@ -264,10 +264,8 @@ class MismatchSample:
 
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists and floats, for JSON."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in values.items()
+            field.name: np.asarray(getattr(self, field.name)).tolist() for field in fields(self)
         }
 
 

@@ -15,9 +15,9 @@ from typing import Final, Self
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
-from servobench.plant.robot.arm import JointLimits, SerialArm, rotation_from_rpy
+from servobench.plant.robot.arm import JointLimits, SerialArm, freeze_arrays, rotation_from_rpy
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.camera_file import OwnCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
@@ -43,17 +43,9 @@ class Links:
     def __post_init__(self) -> None:
         """Check the shapes and freeze the arrays."""
         n = len(self.mass)
-        shapes: dict[str, tuple[int, ...]] = {
-            "mass": (n,),
-            "torque": (n,),
-            "radius": (n,),
-            "aside": (n,),
-            "centre": (n, 3),
-            "inertia": (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2),
-        }
-        for name, shape in shapes.items():
-            array = as_array(name, getattr(self, name), shape)
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, (n,), "mass", "torque", "radius", "aside")
+        freeze_arrays(self, (n, 3), "centre")
+        freeze_arrays(self, (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2), "inertia")
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,13 +167,13 @@ def estimate_links(
     if torque is None:
         torque = _torque_limits(length, mass, payload)
     return Links(
-        mass=mass,
-        centre=centre,
-        inertia=inertia,
-        torque=torque,
-        radius=radius,
-        aside=np.zeros(n),
-        payload=payload,
+        mass,
+        centre,
+        inertia,
+        torque,
+        radius,
+        np.zeros(n),
+        payload,
     )
 
 

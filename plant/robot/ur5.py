@@ -10,8 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import with_tuples
 from servobench.plant.robot.arm import SerialArm, arm_from_dh
@@ -45,4 +43,4 @@ TRAINING_UPPER = _FACTS["training_upper"]
 
 def ur5_arm() -> SerialArm:
     """Return the UR5 by its data sheet."""
-    return replace(arm_from_dh(DH_A, DH_D, DH_ALPHA, JOINT_NAMES), tool=np.array(TOOL))
+    return replace(arm_from_dh(DH_A, DH_D, DH_ALPHA, JOINT_NAMES), tool=TOOL)

@@ -56,7 +56,7 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
         chain = find_chain(tree, tip)
         arm = _arm(chain)
         limits = _limits([link.joint for link in chain.joints])
-        links, note = _links(tree, chain.joints, arm, flaws)
+        links, estimates = _links(tree, chain.joints, arm, flaws)
         try:
             workspace = find_workspace(
                 arm, (limits.lower, limits.upper), (links.radius, links.aside)
@@ -69,18 +69,10 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
         remark(f"robot file {path}: {flaw}; the physics engines refuse it")
     names = arm.joint_names
     line = f"{path.name}: {arm.n} joints from {names[0]} to {names[-1]}, the ball on {chain.tip}"
-    lines = [each for each in (line, chain.ending, note) if each]
-    return Robot(
-        name=path.stem,
-        title=str(tree.name),
-        source=path.name,
-        arm=arm,
-        limits=limits,
-        links=links,
-        workspace=workspace,
-        note="; ".join(lines),
-        flaw=flaw,
-    )
+    lines = [each for each in (line, chain.ending, estimates) if each]
+    note = "; ".join(lines)
+    title = str(tree.name)
+    return Robot(path.stem, title, path.name, arm, limits, links, workspace, note=note, flaw=flaw)
 
 
 def _arm(chain: Chain) -> SerialArm:
@@ -161,7 +153,10 @@ def _links(tree: Tree, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> 
         flaws: takes values that no body has.
     """
     inertials = {link.name: link.inertial for link in tree.links}
-    torque = _torque_limits(chain)
+    efforts = [getattr(link.joint.limit, "effort", None) or 0.0 for link in chain]
+    torque = None
+    if all(isfinite(effort) and effort > 0.0 for effort in efforts):
+        torque = np.array(efforts)
     lacking = []
     for link in chain:
         own = inertials[link.joint.child]
@@ -179,17 +174,6 @@ def _links(tree: Tree, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> 
     mass, centre, inertia = (np.array(each) for each in zip(*bodies, strict=True))
     links = estimate_links(arm, mass, torque, at_far_end(arm, centre, inertia))
     return links, "" if torque is not None else "estimated: torque limits"
-
-
-def _torque_limits(chain: list[Joint]) -> FloatArray | None:
-    """Return the largest torques of the joints, (n,) Nm; None where the file lacks one."""
-    efforts = []
-    for link in chain:
-        effort = getattr(link.joint.limit, "effort", None) or 0.0
-        if not isfinite(effort) or effort <= 0.0:
-            return None
-        efforts.append(effort)
-    return np.array(efforts)
 
 
 class Body(NamedTuple):

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
-from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.arm import SerialArm, freeze_arrays
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
@@ -40,7 +40,7 @@ Pair = tuple[FloatArray, FloatArray]  # (n,) and (n,)
 class Workspace:
     """The part of a robot's reach in which tasks are placed."""
 
-    scale: float  # of all lengths, over those of a UR5's bench
+    scale: float  # all lengths over those of a UR5's bench
     centre: FloatArray  # (3,) [m], base frame; the camera looks at it and turns about it
     shoulder: FloatArray  # (3,) [m], base frame
     home: FloatArray  # (n,) [rad], the start of most runs
@@ -56,17 +56,8 @@ class Workspace:
     def __post_init__(self) -> None:
         """Check the shapes and freeze the arrays."""
         n = len(self.home)
-        shapes = {
-            "centre": 3,
-            "shoulder": 3,
-            "home": n,
-            "lower": n,
-            "upper": n,
-            "stretched": n,
-        }
-        for name, size in shapes.items():
-            array = as_array(name, getattr(self, name), (size,))
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, (3,), "centre", "shoulder")
+        freeze_arrays(self, (n,), "home", "lower", "upper", "stretched")
         moves = {}
         for name, (start, target) in self.moves.items():
             moves[name] = (as_array(name, start, (n,)), as_array(name, target, (n,)))
@@ -87,8 +78,7 @@ class Workspace:
     @property
     def reach(self) -> tuple[float, float]:
         """Least and largest easily reached distance of the ball from the shoulder [m]."""
-        least, largest = REACH
-        return least * self.scale, largest * self.scale
+        return REACH[0] * self.scale, REACH[1] * self.scale
 
     def camera_pose(self) -> FloatArray:
         """Return X_BC, (4, 4), of the camera as planned, which looks straight down at the centre."""
@@ -139,23 +129,16 @@ class Tubes:
 
 def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
     """Return the tubes of links with a `radius`, (n,) m, at an offset `aside`, (n,) m, from their joints."""
-    links = []
-    ends = []
-    radii = []
-
-    def add(i: int, begin: FloatArray, end: FloatArray, share: float) -> None:
-        links.append(i)
-        ends.append((begin, end))
-        radii.append(share * radius[i])
-
+    tubes = []
     for i in range(arm.n):
         next_joint = arm.translation[i + 1]
         side = np.array([0.0, 0.0, aside[i]])
         corner = np.array([next_joint[0], next_joint[1], aside[i]])
-        add(i, side, corner, ASIDE_RADIUS)
+        tubes.append((i, (side, corner), ASIDE_RADIUS * radius[i]))
         if np.linalg.norm(next_joint - corner) > MIN_TUBE_LENGTH:
-            add(i, corner, next_joint, LINK_RADIUS)
-    return Tubes(np.array(links), np.array(ends), np.array(radii))
+            tubes.append((i, (corner, next_joint), LINK_RADIUS * radius[i]))
+    link, ends, radii = map(np.array, zip(*tubes, strict=True))
+    return Tubes(link, ends, radii)
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,13 +383,13 @@ def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> Fou
     pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
     lower, upper = limits
     clear = Clearance(
-        arm=arm,
-        tubes=link_tubes(arm, *shapes),
-        lower=lower,
-        upper=upper,
-        X_BC=pose,
-        scale=scale,
-        ball_radius=BALL_RADIUS * scale,
+        arm,
+        link_tubes(arm, *shapes),
+        lower,
+        upper,
+        pose,
+        scale,
+        BALL_RADIUS * scale,
     )
     rng = np.random.default_rng(0)
     within_turn = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
@@ -483,7 +466,7 @@ def _find_box(clear: Clearance, home: FloatArray) -> Box:
 def _near_home(clear: Clearance, home: FloatArray, seed: int) -> FloatArray:
     """Return postures that are drawn around a home, (s, n) rad."""
     unit = np.random.default_rng(seed).standard_normal((NEAR_STARTS, clear.arm.n))
-    return np.asarray(home + NEAR_DEVIATION * unit)
+    return home + NEAR_DEVIATION * unit
 
 
 def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatArray) -> Pair:
