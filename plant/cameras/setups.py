@@ -312,7 +312,7 @@ class SetupModel(RobotModel):
     cameras: FloatArray  # (..., c, 4, 4), their poses in the frame that they are mounted on
     optics: Optics  # their intrinsics
     target: FloatArray  # (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame
-    distance: float  # from the cameras to the target in the middle of the workspace, as planned [m]
+    distance: float  # distance from the cameras to the target in the middle of the workspace, as planned [m]
     planned: PinholeCamera  # image of a camera as planned, whose focal length decides the natural size of a feature
     far: float  # distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m]
 

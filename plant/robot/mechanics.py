@@ -119,7 +119,7 @@ class MechanicsConfig:
         """Refuse a flexible tool where the features are not the place of the ball.
 
         Raises:
-            ValueError: says so.
+            ValueError: a flexible tool under another sensing.
         """
         if self.tool_frequency > 0.0 and model.channel is not FEATURE:
             raise ValueError(

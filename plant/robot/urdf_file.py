@@ -27,12 +27,11 @@ UNLIMITED: Final = 1e3  # [rad], [rad/s] from which on a limit is none
 DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side, where a joint's limit is not given
 DEFAULT_SPEED: Final = pi  # [rad/s] where a joint's limit is not given
 DEFAULTS: Final = "±2π rad and π rad/s"
-# Shares of a link's largest principal moment:
-# by which the others' sum is above it despite rounding,
+# Share of the largest principal moment by which the others' sum is above it despite rounding
 INERTIA_MARGIN: Final = 1e-6  # [1]
-# by which it may exceed the others' sum without a remark,
+# Share of itself by which the largest principal moment may exceed the others' sum without a remark
 ROUNDED_INERTIA: Final = 5e-3  # [1]
-# and by which it exceeds the others' sum in no real file.
+# Share of itself by which it exceeds the others' sum in no real file
 FLAT_INERTIA: Final = 0.9  # [1]
 # Largest radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
 MAX_GYRATION: Final = 2.0 / 3.0  # [1]
