@@ -55,7 +55,7 @@ LOG_CATEGORIES = {
 REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard for the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
 
-# Unknown, its dependencies, elementwise or as a whole
+# Rows hold an unknown, its dependencies, and whether it depends on them elementwise or as a whole.
 _Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]
 
 
@@ -78,53 +78,53 @@ class Section:
                 dependencies: list[int] = []
                 for name in names:
                     first = self.layout.offsets[name]
-                    dependencies += (
-                        [first + k]
-                        if elementwise
-                        else range(first, first + self.layout.by_name[name].size)
-                    )
+                    if elementwise:
+                        dependencies.append(first + k)
+                    else:
+                        dependencies += range(first, first + self.layout.by_name[name].size)
                 yield self.layout.offsets[unknown] + k, sorted(dependencies)
 
     def arrays(self) -> Iterable[tuple[int, list[int]]]:
         """Yield value reference and dependencies of every group."""
         for unknown, names, _ in self.unknowns:
-            yield self.layout.offsets[unknown], sorted(self.layout.offsets[name] for name in names)
+            dependencies = sorted(self.layout.offsets[name] for name in names)
+            yield self.layout.offsets[unknown], dependencies
 
 
 def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
     """Return outputs, derivatives, initial unknowns and event indicators of an arm with their dependencies."""
-    geometry, computed = (
-        [group.name for group in part] for part in (layout.kinematic, layout.computed)
-    )
-    state = ("joint_position", "joint_velocity")
+    geometry = [group.name for group in layout.kinematic]
+    computed = [group.name for group in layout.computed]
+    joints = ("joint_position", "joint_velocity")
     tool = ("tool_deflection", "tool_velocity")
-    outputs: _Rows = [(name, (name,), True) for name in (*state, *tool)]
-    outputs += [("encoder_position", ("joint_position",), True)]
-    outputs += [(name, ("joint_position", tool[0]), False) for name in computed]
+    command = "joint_velocity_command"
+    outputs: _Rows = [(name, (name,), True) for name in (*joints, *tool)]
+    outputs.append(("encoder_position", ("joint_position",), True))
+    outputs += [(name, ("joint_position", "tool_deflection"), False) for name in computed]
     derivatives: _Rows = [
-        ("der(joint_position)", state, True),
-        ("der(joint_velocity)", (*state, "joint_velocity_command"), True),
-        *((f"der({name})", (*state, *tool), False) for name in tool),
+        ("der(joint_position)", joints, True),
+        ("der(joint_velocity)", (*joints, command), True),
+        ("der(tool_deflection)", (*joints, *tool), False),
+        ("der(tool_velocity)", (*joints, *tool), False),
     ]
     start: _Rows = [
         ("joint_position", ("home",), True),
         ("joint_velocity", (), True),
         ("der(joint_position)", (), True),
-        ("der(joint_velocity)", ("lag", "max_speed", "joint_velocity_command"), True),
-        *((name, (), True) for name in (*tool, *(f"der({name})" for name in tool))),
+        ("der(joint_velocity)", ("lag", "max_speed", command), True),
+        ("tool_deflection", (), True),
+        ("tool_velocity", (), True),
+        ("der(tool_deflection)", (), True),
+        ("der(tool_velocity)", (), True),
         ("encoder_position", ("encoder_resolution", "home"), True),
     ]
     start += [(name, (*geometry, "home"), False) for name in computed]
+    indicators: _Rows = [("stop_indicator", ("joint_position", command), False)]
     return (
         Section("Outputs", "Output", layout, outputs),
         Section("Derivatives", "ContinuousStateDerivative", layout, derivatives),
         Section("InitialUnknowns", "InitialUnknown", layout, start),
-        Section(
-            "",
-            "EventIndicator",
-            layout,
-            [("stop_indicator", (*state[:1], "joint_velocity_command"), False)],
-        ),
+        Section("", "EventIndicator", layout, indicators),
     )
 
 
@@ -146,12 +146,11 @@ class Description:
     model_identifier: str  # file name of the libraries
     summary: str  # one sentence
     layout: Layout  # the variables
-    sections: tuple[Section, ...]  # of the model structure
-    start: Mapping[
-        str, FloatArray
-    ]  # start values of parameters and inputs, flat arrays by group; else zero
+    sections: tuple[Section, ...]  # parts of the model structure
+    # Start values of parameters and inputs, flat arrays by group; all others are zero.
+    start: Mapping[str, FloatArray]
     sources: tuple[str, ...]  # C files to compile, in order
-    step: float  # of the default experiment [s]
+    step: float  # [s] step of the default experiment
     exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation
 
 
@@ -192,35 +191,32 @@ def write_description(description: Description, version: int, token: str) -> byt
     for section in description.sections:
         if version == 3:
             for reference, dependencies in section.arrays():
-                ET.SubElement(
-                    structure,
-                    section.fmi3,
-                    {"valueReference": str(reference)} | _dependent(dependencies),
-                )
+                attributes = {"valueReference": str(reference)} | _dependent(dependencies)
+                ET.SubElement(structure, section.fmi3, attributes)
         elif section.fmi2:
             element = ET.SubElement(structure, section.fmi2)
             for index, dependencies in section.scalars():
-                attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
+                # FMI 2 counts variables from 1 here.
+                indices = [dependency + 1 for dependency in dependencies]
+                attributes = {"index": str(index + 1)} | _dependent(indices)
                 ET.SubElement(element, "Unknown", attributes)
     return xml_bytes(root)
 
 
 def _interfaces(root: ET.Element, description: Description, version: int) -> None:
     """Add model exchange, if there is one, and co-simulation with their capabilities."""
-    derivatives, state = (
-        str(description.exchange).lower(),
-        "FMUstate" if version == 2 else "FMUState",
-    )
+    derivatives = str(description.exchange).lower()
+    state = "FMUstate" if version == 2 else "FMUState"
     capabilities = {"modelIdentifier": description.model_identifier}
     if version == 2:
         capabilities["canNotUseMemoryManagementFunctions"] = "true"
-    capabilities |= {f"canGetAndSet{state}": "true", f"canSerialize{state}": "true"}
+    capabilities[f"canGetAndSet{state}"] = "true"
+    capabilities[f"canSerialize{state}"] = "true"
     if version == 2:
         capabilities["providesDirectionalDerivative"] = derivatives
     else:
-        capabilities |= dict.fromkeys(
-            ("providesDirectionalDerivatives", "providesAdjointDerivatives"), derivatives
-        )
+        capabilities["providesDirectionalDerivatives"] = derivatives
+        capabilities["providesAdjointDerivatives"] = derivatives
     interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
     if description.exchange:
         own = {"completedIntegratorStepNotNeeded": "false"} if version == 2 else {}
@@ -256,7 +252,7 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
     """Return the manifest of FMI-LS-REF.
 
     Args:
-        files: of each related CSV file its path relative to the manifest, its role and a description.
+        files: path relative to the manifest, role and description of each related CSV file.
     """
     namespace = "http://fmi-standard.org/fmi-ls-manifest"
     ET.register_namespace("fmi-ls", namespace)
@@ -275,9 +271,9 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
 def _units(root: ET.Element, used: set[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     # A pixel, or any other unit of a set-up, is a number.
-    own = {
-        name: {"rad": "-1"} if name.endswith("/rad") else {} for name in sorted(used - set(UNITS))
-    }
+    own: dict[str, dict[str, str]] = {}
+    for name in sorted(used - set(UNITS)):
+        own[name] = {"rad": "-1"} if name.endswith("/rad") else {}
     for name, exponents in (UNITS | own).items():
         unit = ET.SubElement(definitions, "Unit", name=name)
         ET.SubElement(unit, "BaseUnit", exponents)
@@ -289,42 +285,44 @@ def _variables(parent: ET.Element, description: Description, version: int) -> No
     """Add every number of FMI 2, every group and the time of FMI 3."""
     layout = description.layout
     for group in layout.groups:
-        first, values = layout.offsets[group.name], description.start.get(group.name)
-        starts = (
-            ["0.0"] * group.size if values is None else [repr(float(value)) for value in values]
-        )
-        for k, name in enumerate(group.scalar_names() if version == 2 else [group.name]):
+        first = layout.offsets[group.name]
+        starts = ["0.0"] * group.size
+        values = description.start.get(group.name)
+        if values is not None:
+            starts = [repr(float(value)) for value in values]
+        names = group.scalar_names() if version == 2 else [group.name]
+        for k, name in enumerate(names):
             attributes = {"name": name, "valueReference": str(first + k), **ATTRIBUTES[group.role]}
             attributes["description"] = group.description
-            bounds = {
-                "displayUnit": DISPLAY_UNITS.get(group.unit),
-                "min": group.minimum,
-                "nominal": group.nominal,
-            }
-            real = {"unit": group.unit} | {
-                name: str(bound) for name, bound in bounds.items() if bound is not None
-            }
+            real = {"unit": group.unit}
+            if group.unit in DISPLAY_UNITS:
+                real["displayUnit"] = DISPLAY_UNITS[group.unit]
+            if group.minimum is not None:
+                real["min"] = str(group.minimum)
+            if group.nominal is not None:
+                real["nominal"] = str(group.nominal)
             if group.role in (PARAMETER, FIXED, INPUT):
                 real["start"] = starts[k] if version == 2 else " ".join(starts)
             if group.role == DERIVATIVE:
                 state = layout.offsets[group.name.removeprefix("der(").removesuffix(")")]
                 real["derivative"] = str(state + k + 1 if version == 2 else state)
             if version == 2:
-                ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes), "Real", real)
+                scalar = ET.SubElement(parent, "ScalarVariable", attributes)
+                ET.SubElement(scalar, "Real", real)
             else:
                 variable = ET.SubElement(parent, "Float64", attributes | real)
                 for size in group.shape:
                     ET.SubElement(variable, "Dimension", start=str(size))
     if version == 3:
         time = {
+            "name": "time",
+            "valueReference": str(layout.size),
             "causality": "independent",
             "variability": "continuous",
             "unit": "s",
             "description": "Simulation time.",
         }
-        ET.SubElement(
-            parent, "Float64", {"name": "time", "valueReference": str(layout.size)} | time
-        )
+        ET.SubElement(parent, "Float64", time)
 
 
 def _dependent(dependencies: list[int]) -> dict[str, str]:

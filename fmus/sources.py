@@ -74,31 +74,34 @@ def layout_header(
     """
     settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
     zero = np.zeros(1)
-    values = np.concatenate(
-        [np.resize(start.get(group.name, zero), group.size) for group in layout.groups]
-    )
-    least = [group.minimum for group in settable for _ in range(group.size)]
-    minima = ["-HUGE_VAL" if each is None else each.hex() for each in least]
-    macros = {
+    groups: list[str] = []
+    values: list[str] = []
+    for group in layout.groups:
+        groups.append(f"{{{layout.offsets[group.name]}, {group.size}}}")
+        group_values = np.resize(start.get(group.name, zero), group.size)
+        values += [float(value).hex() for value in group_values]
+    minima: list[str] = []
+    for group in settable:
+        minimum = "-HUGE_VAL" if group.minimum is None else group.minimum.hex()
+        minima += [minimum] * group.size
+    macros: dict[str, object] = {
         "TOKEN": f'"{token}"',
         "N_GROUPS": len(layout.groups),
         "N_VALUES": layout.size,
-        "N_SETTABLE": sum(group.size for group in settable),
-        **{
-            f"OFFSET_{name.upper().translate(IN_MACROS)}": offset
-            for name, offset in layout.offsets.items()
-        },
-        **constants,
-        "GROUPS": _initialiser(
-            f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups
-        ),
-        "START_VALUES": _initialiser(float(value).hex() for value in values),
-        "MINIMA": _initialiser(minima),
+        "N_SETTABLE": len(minima),
     }
-    return LAYOUT.format("\n".join(f"#define {name} {value}" for name, value in macros.items()))
+    for name, offset in layout.offsets.items():
+        macros[f"OFFSET_{name.upper().translate(IN_MACROS)}"] = offset
+    macros |= constants
+    macros["GROUPS"] = _initialiser(groups)
+    macros["START_VALUES"] = _initialiser(values)
+    macros["MINIMA"] = _initialiser(minima)
+    lines = [f"#define {name} {value}" for name, value in macros.items()]
+    return LAYOUT.format("\n".join(lines))
 
 
 def _initialiser(values: Iterable[str]) -> str:
+    """Return the initialiser of an array in C, as the value of a macro with a line for each number."""
     return "{ \\\n    " + ", \\\n    ".join(values) + "}"
 
 
@@ -124,14 +127,20 @@ def arm_constants(layout: ArmLayout) -> dict[str, float]:
 
 def core_functions(layout: ArmLayout) -> list[Any]:
     """Return the four functions of the kinematic core of an arm."""
-    n, size = layout.by_name["joint_position"].size, sum(group.size for group in layout.kinematic)
-    s, ds = (casadi.SX.sym(name, 2 * n + 6) for name in ("s", "ds"))
-    p, dp = (casadi.SX.sym(name, size) for name in ("p", "dp"))
+    n = layout.by_name["joint_position"].size
+    n_states = 2 * n + 6
+    n_parameters = sum(group.size for group in layout.kinematic)
+    s = casadi.SX.sym("s", n_states)
+    ds = casadi.SX.sym("ds", n_states)
+    p = casadi.SX.sym("p", n_parameters)
+    dp = casadi.SX.sym("dp", n_parameters)
     c = casadi.SX.sym("c", n)
     feature, jacobian, motion, rates = _equations(layout, s, p, c)
     row_major = casadi.vec(jacobian.T)
-    outputs = casadi.vertcat(feature, row_major), rates
-    along = [casadi.jtimes(each, casadi.vertcat(s, p), casadi.vertcat(ds, dp)) for each in outputs]
+    variables = casadi.vertcat(s, p)
+    direction = casadi.vertcat(ds, dp)
+    outputs = (casadi.vertcat(feature, row_major), rates)
+    along = [casadi.jtimes(each, variables, direction) for each in outputs]
     return [
         casadi.Function("arm_feature", [s, p, c], [feature], {"cse": True}),
         casadi.Function("arm_jacobian", [s, p, c], [row_major], {"cse": True}),
@@ -142,8 +151,13 @@ def core_functions(layout: ArmLayout) -> list[Any]:
 
 def _equations(layout: ArmLayout, s: SX, p: SX, c: SX) -> tuple[SX, SX, SX, SX]:
     """Return the outputs before the Jacobian, the Jacobian, motion of a rigid tool and rates of a flexible one."""
-    part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
-    arm, view, n = _arm(part), layout.view, c.numel()
+    part = {}
+    for group in layout.kinematic:
+        first = layout.offsets[group.name]
+        part[group.name] = p[first:][: group.size]
+    arm = _arm(part)
+    view = layout.view
+    n = c.numel()
     q, v, deflection, w = casadi.vertsplit(s, [0, n, 2 * n, 2 * n + 3, 2 * n + 6])
     phase = part["ripple_order"] * q
     x = q + part["ripple"] * casadi.sin(phase) + c
@@ -155,21 +169,22 @@ def _equations(layout: ArmLayout, s: SX, p: SX, c: SX) -> tuple[SX, SX, SX, SX]:
         places = points_in_cameras(x, geometry, view.mount)
         seen = valid_features(places, geometry.optics, view.setup)
         measured = features(places, geometry.optics, view.setup)
-        feature, jacobian = casadi.vertcat(measured, seen), casadi.jacobian(measured, q)
+        feature = casadi.vertcat(measured, seen)
+        jacobian = casadi.jacobian(measured, q)
         place = casadi.SX.zeros(3)  # only the ball hangs on a flexible tool
     speed = slope * v
+    # Within its play a joint is not carried along; its gear pushes it at one end of the play only.
     pushed = casadi.if_else(speed > 0.0, c <= -part["backlash"], c >= part["backlash"])
     carried = casadi.jtimes(place, q, v * pushed)
-    omega, slip = part["tool_frequency"], w - carried
-    rates = casadi.vertcat(
-        slip, -(omega**2) * deflection - 2.0 * part["tool_damping"] * omega * slip
-    )
-    return (
-        feature,
-        jacobian,
-        casadi.vertcat(place, carried),
-        casadi.if_else(omega > 0.0, rates, 0.0),
-    )
+    motion = casadi.vertcat(place, carried)
+    # Rates of the flexible tool: δ̇ = w − ṗ_B, ẇ = −ω² δ − 2 ζ ω δ̇.
+    omega = part["tool_frequency"]
+    zeta = part["tool_damping"]
+    slip = w - carried
+    acceleration = -(omega**2) * deflection - 2.0 * zeta * omega * slip
+    flexible = casadi.vertcat(slip, acceleration)
+    rates = casadi.if_else(omega > 0.0, flexible, 0.0)
+    return feature, jacobian, motion, rates
 
 
 def _ball(
@@ -179,19 +194,19 @@ def _ball(
     R_BC = symbolic_rotation(part["camera_rpy"])
     axes, origins, rotation, position = arm_frames(q, arm)
     ball = position + rotation @ part["tool"]
-    columns = [
-        slope[i] * (arm.gear_ratio[i] * casadi.cross(axis, ball - origin))
-        for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
-    ]
-    feature = R_BC.T @ (ball + deflection - part["camera_position"])
-    return (
-        casadi.vertcat(feature, casadi.SX.ones(feature.numel())),
-        R_BC.T @ casadi.horzcat(*columns),
-        ball,
-    )
+    columns = []
+    for i, (axis, origin) in enumerate(zip(axes, origins, strict=True)):
+        lever = casadi.cross(axis, ball - origin)
+        columns.append(slope[i] * (arm.gear_ratio[i] * lever))
+    position_in_camera = R_BC.T @ (ball + deflection - part["camera_position"])
+    seen = casadi.SX.ones(position_in_camera.numel())
+    feature = casadi.vertcat(position_in_camera, seen)
+    jacobian = R_BC.T @ casadi.horzcat(*columns)
+    return feature, jacobian, ball
 
 
 def _arm(part: Mapping[str, SX]) -> ArmGeometry:
+    """Return the geometry of the arm from its parameters by name."""
     columns = casadi.horzcat(part["a"], part["y"], part["d"])
     angles = casadi.horzcat(part["alpha"], part["pitch"], part["yaw"])
     return ArmGeometry(
@@ -203,21 +218,25 @@ def _arm(part: Mapping[str, SX]) -> ArmGeometry:
 
 
 def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry:
+    """Return the geometry of arm, target and cameras from their parameters by name."""
     c = view.setup.cameras
+    further = None
+    if view.calibration:
+        further = _objects(part["calibration"], (c, view.calibration))
     optics = Optics(
-        _objects(part["focal_length"], (c,)),
-        _objects(part["principal_point"], (c, 2)),
-        _objects(part["distortion"], (c,)),
-        view.size,
-        _objects(part["calibration"], (c, view.calibration)) if view.calibration else None,
+        focal=_objects(part["focal_length"], (c,)),
+        centre=_objects(part["principal_point"], (c, 2)),
+        distortion=_objects(part["distortion"], (c,)),
+        size=view.size,
+        further=further,
     )
-    positions, angles = (
-        casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy")
-    )
-    poses = [
-        (symbolic_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)
-    ]
-    return SetupGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
+    positions = casadi.vertsplit(part["camera_position"], 3)
+    angles = casadi.vertsplit(part["camera_rpy"], 3)
+    poses = []
+    for rpy, position in zip(angles, positions, strict=True):
+        poses.append((symbolic_rotation(rpy), position))
+    target = casadi.vertsplit(part["target"], 3)
+    return SetupGeometry(arm, target, poses, optics)
 
 
 def _objects(values: SX, shape: tuple[int, ...]) -> npt.NDArray[Any]:

@@ -20,11 +20,19 @@ from servobench.plant.cameras.optics import COLUMNS
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.arm import narrow_limits, rpy_from_rotation
+from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.mechanics import MechanicsConfig
 
-PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
-DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
+# Roles of variables.
+PARAMETER: Final = "parameter"
+FIXED: Final = "fixed parameter"
+INPUT: Final = "input"
+STATE: Final = "state"
+DERIVATIVE: Final = "derivative"
+INDICATOR: Final = "event indicator"
+OUTPUT: Final = "output"
+SAMPLED: Final = "sampled output"
 
 FEATURE: Final = "feature"
 BALL: Final = "ball_position"  # name of the feature without a set-up of cameras
@@ -51,9 +59,12 @@ class Group:
     def scalar_names(self) -> Iterator[str]:
         """Yield the names of its numbers as FMI 2 shows them, in row-major order; indices start at 1."""
         inner = self.name.removeprefix("der(").removesuffix(")")
-        for index in product(*(range(1, size + 1) for size in self.shape)):
+        axes = [range(1, size + 1) for size in self.shape]
+        for index in product(*axes):
             scalar = f"{inner}[{','.join(map(str, index))}]"
-            yield f"der({scalar})" if self.role == DERIVATIVE else scalar
+            if self.role == DERIVATIVE:
+                scalar = f"der({scalar})"
+            yield scalar
 
 
 class View(NamedTuple):
@@ -63,7 +74,7 @@ class View(NamedTuple):
     """
 
     setup: SensingSetup  # the set-up
-    mount: Mount  # of its cameras
+    mount: Mount  # where its cameras are mounted
     size: tuple[float, float]  # width and height of the images [px]
     calibration: int  # numbers of each camera in `Optics.further`; 0 for none
 
@@ -84,45 +95,49 @@ class View(NamedTuple):
     @property
     def setting(self) -> str:
         """Features and place of the cameras, for descriptions."""
-        return (
-            f"{self.setup.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
-        )
+        place = "beside the arm" if self.mount == "fixed" else "on the hand"
+        return f"{self.setup.summary}, {place}"
 
     def parameters(self) -> tuple[Group, ...]:
         """Return the kinematic parameters of target and cameras, in order."""
-        c, p = self.setup.cameras, len(self.setup.target)
-        on, off = ("base", "flange") if self.mount == "fixed" else ("flange", "base")
+        c = self.setup.cameras
+        p = len(self.setup.target)
+        # Cameras beside the arm see a target on the flange, cameras on the hand one beside the arm.
+        camera_frame = "base" if self.mount == "fixed" else "flange"
+        target_frame = "flange" if self.mount == "fixed" else "base"
+        points = f"Points of the target in the {target_frame} frame."
+        turned = f"Roll, pitch and yaw of the cameras in the {camera_frame} frame."
         middle = "Principal point, from the upper left corner of the image."
-        turned = f"Roll, pitch and yaw of the cameras in the {on} frame."
+        groups = (
+            Group("target", (p, 3), PARAMETER, "m", points),
+            Group(
+                "camera_position", (c, 3), PARAMETER, "m", f"Cameras in the {camera_frame} frame."
+            ),
+            Group("camera_rpy", (c, 3), PARAMETER, "rad", turned),
+            Group("focal_length", (c,), PARAMETER, "px", "Focal length of each camera."),
+            Group("principal_point", (c, 2), PARAMETER, "px", middle),
+            Group("distortion", (c,), PARAMETER, "1", "First coefficient of radial distortion."),
+        )
+        if self.calibration == 0:
+            return groups
         further = "f_y/f_x, k2, p1, p2, k3 of OpenCV's model, and the largest squared tangent of a visible ray"
         last = {
             COLUMNS["rational_polynomial"]: ", and k4, k5, k6",
             COLUMNS["equidistant"]: ", and k4 of a fisheye",
         }
         further += last.get(self.calibration, "") + "."
-        return (
-            Group("target", (p, 3), PARAMETER, "m", f"Points of the target in the {off} frame."),
-            Group("camera_position", (c, 3), PARAMETER, "m", f"Cameras in the {on} frame."),
-            Group("camera_rpy", (c, 3), PARAMETER, "rad", turned),
-            Group("focal_length", (c,), PARAMETER, "px", "Focal length of each camera."),
-            Group("principal_point", (c, 2), PARAMETER, "px", middle),
-            Group("distortion", (c,), PARAMETER, "1", "First coefficient of radial distortion."),
-            *(
-                [Group("calibration", (c, self.calibration), PARAMETER, "1", further)]
-                if self.calibration
-                else []
-            ),
-        )
+        calibration = Group("calibration", (c, self.calibration), PARAMETER, "1", further)
+        return (*groups, calibration)
 
     def outputs(self, n: int) -> tuple[Group, ...]:
         """Return the outputs of an arm with `n` joints that the generated core computes."""
-        m, unit = self.setup.m, self.setup.unit
+        m = self.setup.m
+        unit = self.setup.unit
+        measured = f"Measured features: {', '.join(self.setup.features)}."
         visible = "1 where a camera sees the feature, with nothing in between; 0 elsewhere."
         slope = "Derivative of feature by joint_position; for evaluation."
         return (
-            Group(
-                FEATURE, (m,), OUTPUT, unit, f"Measured features: {', '.join(self.setup.features)}."
-            ),
+            Group(FEATURE, (m,), OUTPUT, unit, measured),
             Group(SEEN, (m,), OUTPUT, "1", visible),
             Group("jacobian", (m, n), OUTPUT, f"{unit}/rad", slope),
         )
@@ -135,7 +150,7 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
 
     Args:
         n: number of joints.
-        view: of a sensing set-up; None for the ball in 3-D by a fixed camera.
+        view: the part of a sensing set-up; None for the ball in 3-D by a fixed camera.
     """
     table = "transform after joint i"
     return (
@@ -278,7 +293,7 @@ def _ball_outputs(n: int) -> tuple[Group, ...]:
 class Layout:
     """The groups and their offsets in the flat vector of values."""
 
-    groups: tuple[Group, ...]  # of the model
+    groups: tuple[Group, ...]  # all variables of the model
 
     @cached_property
     def by_name(self) -> dict[str, Group]:
@@ -305,42 +320,30 @@ class Layout:
 class ArmLayout(Layout):
     """The layout of an arm."""
 
-    view: View | None = None  # of a sensing set-up; None for the ball in 3-D by a fixed camera
+    view: View | None = None  # part of a sensing set-up; None for the ball in 3-D by a fixed camera
 
     @property
     def kinematic(self) -> tuple[Group, ...]:
         """The parameters of the generated core, which come first."""
-        return self.groups[: [*self.by_name].index("lag")]
+        names = list(self.by_name)
+        return self.groups[: names.index("lag")]
 
     @property
     def computed(self) -> tuple[Group, ...]:
         """The outputs of the generated core, which come last: the feature first, the Jacobian last."""
-        return self.groups[[*self.by_name].index("encoder_position") + 1 :]
+        names = list(self.by_name)
+        return self.groups[names.index("encoder_position") + 1 :]
 
 
 def parameters_of(setup: PlantSetup, config: KinematicConfig) -> dict[str, FloatArray]:
     """Return the FMU's parameters for the kinematic plant of these arguments by group, (..., size)."""
     model, home = setup.robot()
-    arm, n, mechanics = model.arm, model.arm.n, config.mechanics
+    n = model.arm.n
     stops = narrow_limits(setup.limits, n, config.max_joint_speed, config.joint_range)
-    columns = {"a": 0, "y": 1, "d": 2}
-    angles = {"alpha": 0, "pitch": 1, "yaw": 2}
     return {
-        "base_position": arm.translation[..., 0, :],
-        "base_rpy": arm.rpy[..., 0, :],
-        **{name: arm.translation[..., 1:, column] for name, column in columns.items()},
-        **{name: arm.rpy[..., 1:, column] for name, column in angles.items()},
-        "joint_offset": arm.joint_offset,
-        "gear_ratio": arm.gear_ratio,
+        **_arm_parameters(model.arm),
         **_sensing_parameters(model),
-        **{
-            name: np.full(n, getattr(mechanics, name))
-            for name in ("backlash", "ripple", "ripple_order")
-        },
-        **{
-            name: np.array([getattr(mechanics, name)])
-            for name in ("tool_frequency", "tool_damping")
-        },
+        **_mechanics_parameters(config.mechanics, n),
         "lag": np.full(n, config.lag),
         "max_speed": stops.speed,
         "joint_lower": stops.lower,
@@ -350,22 +353,65 @@ def parameters_of(setup: PlantSetup, config: KinematicConfig) -> dict[str, Float
     }
 
 
+def _arm_parameters(arm: SerialArm) -> dict[str, FloatArray]:
+    """Return the values of the kinematic parameters of an arm by name, (..., size).
+
+    Its first transform leads to joint 1, the others from joint i to joint i + 1.
+    """
+    base_position = arm.translation[..., 0, :]
+    base_rpy = arm.rpy[..., 0, :]
+    translation = arm.translation[..., 1:, :]
+    rpy = arm.rpy[..., 1:, :]
+    return {
+        "base_position": base_position,
+        "base_rpy": base_rpy,
+        "a": translation[..., 0],
+        "y": translation[..., 1],
+        "d": translation[..., 2],
+        "alpha": rpy[..., 0],
+        "pitch": rpy[..., 1],
+        "yaw": rpy[..., 2],
+        "joint_offset": arm.joint_offset,
+        "gear_ratio": arm.gear_ratio,
+    }
+
+
+def _mechanics_parameters(mechanics: MechanicsConfig, n: int) -> dict[str, FloatArray]:
+    """Return the values of the parameters of gears, the same for all n joints, and of the tool by name, (size,)."""
+    return {
+        "backlash": np.full(n, mechanics.backlash),
+        "ripple": np.full(n, mechanics.ripple),
+        "ripple_order": np.full(n, mechanics.ripple_order),
+        "tool_frequency": np.array([mechanics.tool_frequency]),
+        "tool_damping": np.array([mechanics.tool_damping]),
+    }
+
+
 def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
     """Return the values of the parameters of target and cameras by name, (..., size)."""
     if not isinstance(model, SetupModel):
-        pose, angles = model.camera, rpy_from_rotation(model.camera[..., :3, :3])
-        return {"tool": model.arm.tool, "camera_position": pose[..., :3, 3], "camera_rpy": angles}
-
-    def flat(values: FloatArray) -> FloatArray:
-        return np.reshape(values, (*values.shape[:-2], -1))
-
+        X_BC = model.camera
+        return {
+            "tool": model.arm.tool,
+            "camera_position": X_BC[..., :3, 3],
+            "camera_rpy": rpy_from_rotation(X_BC[..., :3, :3]),
+        }
     optics = model.optics
-    return {
-        "target": flat(model.target),
-        "camera_position": flat(model.cameras[..., :3, 3]),
-        "camera_rpy": flat(rpy_from_rotation(model.cameras[..., :3, :3])),
+    positions = model.cameras[..., :3, 3]
+    angles = rpy_from_rotation(model.cameras[..., :3, :3])
+    values = {
+        "target": _flat(model.target),
+        "camera_position": _flat(positions),
+        "camera_rpy": _flat(angles),
         "focal_length": optics.focal,
-        "principal_point": flat(optics.centre),
+        "principal_point": _flat(optics.centre),
         "distortion": optics.distortion,
-        **({} if optics.further is None else {"calibration": flat(optics.further)}),
     }
+    if optics.further is not None:
+        values["calibration"] = _flat(optics.further)
+    return values
+
+
+def _flat(values: FloatArray) -> FloatArray:
+    """Return matrices (..., i, j) as vectors (..., i j)."""
+    return np.reshape(values, (*values.shape[:-2], -1))
