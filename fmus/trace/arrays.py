@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-Expression: TypeAlias = Any  # of CasADi: MX
+Expression: TypeAlias = Any  # casadi.MX
 Places: TypeAlias = npt.NDArray[np.intp]
 Operation = Callable[..., Expression]
 DTYPES = {"b": np.dtype(np.bool_), "i": np.dtype(np.int_), "f": np.dtype(np.float64)}
@@ -41,9 +41,9 @@ class Buffer:
 class Traced(NDArrayOperatorsMixin):
     """An array of expressions."""
 
-    buffer: Buffer  # of its numbers
-    places: Places  # of its entries in the buffer
-    kind: str = "f"  # of its numbers, as numpy's: "b", "i" or "f"
+    buffer: Buffer  # holds its numbers
+    places: Places  # positions of its entries in the buffer
+    kind: str = "f"  # kind of its numbers, as numpy's: "b", "i" or "f"
     function: ClassVar[Callable[..., Any]]
     """Carries out a function of numpy that is no ufunc; `servobench.fmus.trace.record` sets it."""
     flags: ClassVar[SimpleNamespace] = SimpleNamespace(writeable=True)
@@ -78,14 +78,17 @@ class Traced(NDArrayOperatorsMixin):
 
     def flat(self) -> Expression:
         """Return its entries as an expression (size, 1), in row-major order."""
-        content, places = self.buffer.content, self.places.reshape(-1)
+        content = self.buffer.content
+        places = self.places.reshape(-1)
         if self.constant:
             return casadi.MX(casadi.DM(content[places]))
         if places.size == content.numel() and np.array_equal(places, np.arange(places.size)):
             return content
         if content.numel() == 1:
             return casadi.repmat(content, places.size, 1)
-        return content.nz[places.tolist()] if places.size else casadi.MX(0, 1)
+        if places.size == 0:
+            return casadi.MX(0, 1)
+        return content.nz[places.tolist()]
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:  # noqa: ANN401
         """Carry out a ufunc, or a reduction by one, with at least one array of expressions.
@@ -96,9 +99,9 @@ class Traced(NDArrayOperatorsMixin):
         outputs = options.pop("out", None)
         options.pop("dtype", None)
         if all(not isinstance(each, Traced) or each.constant for each in inputs):
-            result = getattr(ufunc, method)(
-                *map(as_numbers, inputs), **_plain_options(options, outputs)
-            )
+            numbers = [as_numbers(each) for each in inputs]
+            plain_options = _plain_options(options, outputs)
+            result = getattr(ufunc, method)(*numbers, **plain_options)
         elif method == "__call__":
             result = _called(ufunc, inputs, options, outputs)
         elif method == "reduce":
@@ -148,9 +151,11 @@ class Traced(NDArrayOperatorsMixin):
 
     def __getitem__(self, key: Any) -> Traced:  # noqa: ANN401 - any index
         """Return a view, or a copy of the entries that a traced index names along the first axis."""
-        if isinstance(key, Traced):
-            return self[key.numbers()] if key.constant or key.kind == "b" else picked(self, key)
-        return self.arranged(self.places[as_numbers(key)])
+        if not isinstance(key, Traced):
+            return self.arranged(self.places[as_numbers(key)])
+        if key.constant or key.kind == "b":
+            return self[key.numbers()]
+        return picked(self, key)
 
     def __setitem__(self, key: Any, value: Any) -> None:  # noqa: ANN401 - any index, any array
         """Write to the buffer."""
@@ -159,10 +164,12 @@ class Traced(NDArrayOperatorsMixin):
             self.buffer.content = self.buffer.content.copy()
             self.buffer.content[places] = as_numbers(value)
         else:
-            content = casadi.MX(
-                casadi.DM(self.buffer.content) if self.constant else self.buffer.content
-            )
-            content.nz[places.reshape(-1).tolist()] = spread(as_traced(value), places.shape).flat()
+            before = self.buffer.content
+            if self.constant:
+                before = casadi.DM(before)
+            content = casadi.MX(before)
+            values = spread(as_traced(value), places.shape)
+            content.nz[places.reshape(-1).tolist()] = values.flat()
             self.buffer.content = content
 
     def arranged(self, places: Places) -> Traced:
@@ -171,11 +178,9 @@ class Traced(NDArrayOperatorsMixin):
 
     def copy(self) -> Traced:
         """Return a copy with a buffer of its own."""
-        return (
-            Traced.plain(self.numbers())
-            if self.constant
-            else Traced.of(self.flat(), self.shape, self.kind)
-        )
+        if self.constant:
+            return Traced.plain(self.numbers())
+        return Traced.of(self.flat(), self.shape, self.kind)
 
     def astype(self, dtype: npt.DTypeLike) -> Traced:
         """Return the numbers as another type; numbers are truncated to whole ones."""
@@ -213,7 +218,10 @@ class Traced(NDArrayOperatorsMixin):
 
 
 _COUNTER = count()
-SIZES, TRANSPOSES, VIEWS = {"shape", "ndim", "size"}, {"T", "mT"}, {"reshape", "swapaxes"}
+# Attributes of numpy's arrays that hold for the table of places as well.
+SIZES = {"shape", "ndim", "size"}
+TRANSPOSES = {"T", "mT"}
+VIEWS = {"reshape", "swapaxes"}
 METHODS = {
     "sum", "mean", "max", "min", "any", "all", "argmin", "argmax", "cumsum", "trace", "diagonal", "take", "dot",
     "repeat", "ravel", "squeeze", "transpose", "clip",
@@ -242,19 +250,21 @@ def picked(array: Any, index: Traced) -> Traced:  # noqa: ANN401 - any array
     table = as_traced(array)
     rest = table.shape[1:]
     width = int(np.prod(rest))
-    begin = casadi.vec(casadi.repmat(width * index.flat().T, width, 1))
+    # A row of the table has `width` places, the first of which is at width × index.
+    first = casadi.vec(casadi.repmat(width * index.flat().T, width, 1))
     along = np.tile(np.arange(width, dtype=np.float64), index.size)
-    return Traced.of(table.flat().nz[begin + casadi.DM(along)], (*index.shape, *rest), table.kind)
+    entries = table.flat().nz[first + casadi.DM(along)]
+    return Traced.of(entries, (*index.shape, *rest), table.kind)
 
 
 def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> Traced:
     """Return arrays as one: `arrange` puts the tables of their places together as numpy would the arrays."""
     parts = [as_traced(array) for array in arrays]
-    ends = np.cumsum([0, *(part.size for part in parts)])
-    tables = [
-        first + np.arange(part.size).reshape(part.shape)
-        for first, part in zip(ends, parts, strict=False)
-    ]
+    tables = []
+    first = 0
+    for part in parts:
+        tables.append(first + np.arange(part.size).reshape(part.shape))
+        first += part.size
     kind = max((part.kind for part in parts), key="bif".index)
     content = casadi.vertcat(*(part.flat() for part in parts))
     return Traced(Buffer(content), arrange(tables), kind)
@@ -266,8 +276,9 @@ MAX_FLOAT = float(np.finfo(np.float64).max)
 def _rounded(x: Expression) -> Expression:
     """Return the nearest whole number; ties go to the even one."""
     nearest = casadi.floor(x + 0.5)
-    tie = casadi.logic_and(nearest - x == 0.5, casadi.fmod(nearest, 2.0) != 0.0)
-    return nearest - tie
+    halfway = nearest - x == 0.5
+    odd = casadi.fmod(nearest, 2.0) != 0.0
+    return nearest - casadi.logic_and(halfway, odd)
 
 
 ARITHMETIC: Mapping[str, Operation] = {
@@ -288,12 +299,14 @@ COMPARISONS: Mapping[str, Operation] = {
     "isfinite": lambda x: casadi.fabs(x) <= MAX_FLOAT,
     "isnan": lambda x: casadi.logic_not(casadi.fabs(x) <= np.inf),
 }  # fmt: skip
-OF_TRUTH: Mapping[str, str] = {
+# Operations on bits are logical ones on arrays of truth.
+LOGICAL_NAMES: Mapping[str, str] = {
     "bitwise_and": "logical_and",
     "bitwise_or": "logical_or",
     "invert": "logical_not",
 }
-FROM_TRUTH = {
+# The results of reductions over no entries.
+EMPTY_REDUCTIONS = {
     "add": 0.0,
     "multiply": 1.0,
     "maximum": -np.inf,
@@ -328,8 +341,8 @@ def _called(
 def elementwise(name: str, *inputs: Any) -> Traced:  # noqa: ANN401 - anything array-like
     """Return a ufunc of its name, entry by entry."""
     arrays = [as_traced(each) for each in inputs]
-    if name in OF_TRUTH and all(each.kind == "b" for each in arrays):
-        name = OF_TRUTH[name]
+    if name in LOGICAL_NAMES and all(each.kind == "b" for each in arrays):
+        name = LOGICAL_NAMES[name]
     if name in COMPARISONS:
         return mapped(COMPARISONS[name], arrays, "b")
     if name not in ARITHMETIC:
@@ -366,44 +379,51 @@ def reduced(
     initial: Any = None,  # noqa: ANN401
 ) -> Traced:
     """Return the reduction by a ufunc of its name over axes, None for all."""
-    if name in OF_TRUTH:
-        name = OF_TRUTH[name]
-    if name not in FROM_TRUTH:
+    if name in LOGICAL_NAMES:
+        name = LOGICAL_NAMES[name]
+    if name not in EMPTY_REDUCTIONS:
         raise NotTraceable(f"it calls numpy.{name}.reduce, which has no exported form")
     table = as_traced(array)
-    axes = (
-        tuple(range(table.ndim))
-        if axis is None
-        else (axis,)
-        if isinstance(axis, int)
-        else tuple(axis)
-    )
-    axes = tuple(each % table.ndim for each in axes)
+    axes = _axes_of(axis, table.ndim)
     kept = tuple(size for i, size in enumerate(table.shape) if i not in axes)
     length = int(np.prod([table.shape[i] for i in axes]))
     count = int(np.prod(kept))
-    last = table.arranged(
-        np.moveaxis(table.places, axes, range(-len(axes), 0)).reshape(count, length)
-    )
-    kind = "b" if name.startswith("logical") else "i" if table.kind in "bi" else "f"
+    # Rows of entries that are reduced to one each: the reduced axes are the last ones.
+    moved = np.moveaxis(table.places, axes, range(-len(axes), 0))
+    rows = table.arranged(moved.reshape(count, length))
+    logical = name.startswith("logical")
     operation = ARITHMETIC.get(name) or COMPARISONS[name]
     result: Expression
-    if name == "add" and length:
-        result = casadi.vec(casadi.sum1(casadi.reshape(last.flat(), length, count)))
+    if length == 0:
+        result = casadi.MX(casadi.DM(np.full(count, EMPTY_REDUCTIONS[name])))
+    elif name == "add":
+        columns = casadi.reshape(rows.flat(), length, count)
+        result = casadi.vec(casadi.sum1(columns))
     else:
-        result = (
-            last[:, 0].flat() if length else casadi.MX(casadi.DM(np.full(count, FROM_TRUTH[name])))
-        )
+        result = rows[:, 0].flat()
         for j in range(1, length):
-            result = operation(result, last[:, j].flat())
-    if name.startswith("logical") and length == 1:
+            result = operation(result, rows[:, j].flat())
+    if logical and length == 1:
         result = result != 0.0
     if initial is not None:
         result = operation(result, float(initial))
-    shape = (
-        tuple(1 if i in axes else size for i, size in enumerate(table.shape)) if keepdims else kept
-    )
+    kind = "f"
+    if logical:
+        kind = "b"
+    elif table.kind in "bi":
+        kind = "i"
+    shape = kept
+    if keepdims:
+        shape = tuple(1 if i in axes else size for i, size in enumerate(table.shape))
     return Traced.of(result, shape, kind)
+
+
+def _axes_of(axis: Any, ndim: int) -> tuple[int, ...]:  # noqa: ANN401 - as numpy's
+    """Return the numbers of axes, counted from the first one, for one axis, several, or None for all."""
+    if axis is None:
+        return tuple(range(ndim))
+    axes = (axis,) if isinstance(axis, int) else tuple(axis)
+    return tuple(each % ndim for each in axes)
 
 
 def matmul(a: Traced, b: Traced) -> Traced:
@@ -412,22 +432,25 @@ def matmul(a: Traced, b: Traced) -> Traced:
         return matmul(a[None, :], b)[..., 0, :]
     if b.ndim == 1:
         return matmul(a, b[:, None])[..., 0]
-    (i, k), j = a.shape[-2:], b.shape[-1]
+    i, k = a.shape[-2:]
+    j = b.shape[-1]
     if b.shape[-2] != k:
         raise ValueError(f"matmul: {a.shape} does not fit {b.shape}")
     lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    left, right = (
-        spread(a, (*lead, i, k)).reshape(-1, i, k),
-        spread(b, (*lead, k, j)).reshape(-1, k, j),
-    )
+    left = spread(a, (*lead, i, k)).reshape(-1, i, k)
+    right = spread(b, (*lead, k, j)).reshape(-1, k, j)
+    shape = (*lead, i, j)
     if 0 in (i, j, k) or len(left) == 0:
-        return Traced.of(casadi.MX.zeros(int(np.prod((*lead, i, j))), 1), (*lead, i, j))
-    # Row-major entries are the column-major ones of the transpose, and (A B)ᵀ = Bᵀ Aᵀ.
-    products = [
-        casadi.vec(casadi.mtimes(casadi.reshape(B.flat(), j, k), casadi.reshape(A.flat(), k, i)))
-        for A, B in zip(left, right, strict=True)
-    ]
-    return Traced.of(casadi.vertcat(*products), (*lead, i, j))
+        zeros = casadi.MX.zeros(int(np.prod(shape)), 1)
+        return Traced.of(zeros, shape)
+    products = []
+    for A, B in zip(left, right, strict=True):
+        # Row-major entries are the column-major ones of the transpose, and (A B)ᵀ = Bᵀ Aᵀ.
+        B_transposed = casadi.reshape(B.flat(), j, k)
+        A_transposed = casadi.reshape(A.flat(), k, i)
+        product = casadi.mtimes(B_transposed, A_transposed)
+        products.append(casadi.vec(product))
+    return Traced.of(casadi.vertcat(*products), shape)
 
 
 def vecdot(a: Traced, b: Traced) -> Traced:

@@ -27,9 +27,8 @@ _NUMBERS = count()
 class Frame:
     """The faults of a function that is being recorded."""
 
-    code: Expression = field(
-        default_factory=lambda: casadi.MX(0.0)
-    )  # of the worst one, an expression
+    # Code of the worst fault, an expression.
+    code: Expression = field(default_factory=lambda: casadi.MX(0.0))
 
 
 _FRAMES: list[Frame] = []
@@ -38,9 +37,10 @@ _FRAMES: list[Frame] = []
 @contextmanager
 def frame() -> Iterator[Frame]:
     """Collect the faults within."""
-    _FRAMES.append(Frame())
+    own = Frame()
+    _FRAMES.append(own)
     try:
-        yield _FRAMES[-1]
+        yield own
     finally:
         _FRAMES.pop()
 
@@ -79,8 +79,11 @@ def with_leaves(tree: Tree, leaves: list[Any]) -> Tree:
 
 def symbols_like(leaves: list[Any]) -> list[Traced]:
     """Return an array of symbols for each array."""
-    return [Traced.of(casadi.MX.sym(f"x{k}", int(np.size(leaf))), np.shape(leaf), leaf.dtype.kind)
-            for k, leaf in enumerate(leaves)]  # fmt: skip
+    symbols = []
+    for k, leaf in enumerate(leaves):
+        symbol = casadi.MX.sym(f"x{k}", int(np.size(leaf)))
+        symbols.append(Traced.of(symbol, np.shape(leaf), leaf.dtype.kind))
+    return symbols
 
 
 def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
@@ -99,6 +102,7 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
     own = list(given)
     for k, symbol in zip(places, symbols, strict=True):
         own[k] = symbol
+    # Both ways are recorded with symbols in place of all expressions that they are given.
     inside, among = with_leaves((tree, arguments), own)
     before = leaves_of(inside)
     with frame() as faults:
@@ -108,16 +112,18 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
         raise NotTraceable(f"the shape of the result of {_name(function)} depends on the run")
     changed = [k for k, (new, old) in enumerate(zip(after, before, strict=True)) if new is not old]
     inputs = [symbol.buffer.content for symbol in symbols]
-    ways = [
-        _function(function, inputs, [*(as_traced(leaves[k]).flat() for k in changed), code])
-        for leaves, code in ((after, faults.code), (before, casadi.MX(0.0)))
-    ]
+    ways = []
+    for leaves, code in ((after, faults.code), (before, casadi.MX(0.0))):
+        outputs = [as_traced(leaves[k]).flat() for k in changed]
+        ways.append(_function(function, inputs, [*outputs, code]))
     switch = casadi.Function.if_else(f"branch{next(_NUMBERS)}", *ways)
-    *results, code = switch.call([chosen.flat(), *(given[k].flat() for k in places)])
+    values = [given[k].flat() for k in places]
+    *results, code = switch.call([chosen.flat(), *values])
     note_code(code)
     merged = leaves_of(tree)
     for k, expression in zip(changed, results, strict=True):
-        kind = max(as_traced(after[k]).kind, as_traced(before[k]).kind, key="bif".index)
+        kinds = (as_traced(after[k]).kind, as_traced(before[k]).kind)
+        kind = max(kinds, key="bif".index)
         merged[k] = Traced.of(expression, np.shape(before[k]), kind)
     return with_leaves(tree, merged)
 
@@ -129,13 +135,15 @@ def _side_by_side(
     *arguments: Any,  # noqa: ANN401
 ) -> Tree:
     """Return the results of `branch` for each lane by itself."""
-    results = [
-        branch(chosen[lane], function, take(tree, lane), *(take(each, lane) for each in arguments))
-        for lane in np.ndindex(chosen.shape)
-    ]
-    return map_arrays(
-        lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results
-    )
+    results = []
+    for lane in np.ndindex(chosen.shape):
+        own = [take(each, lane) for each in arguments]
+        results.append(branch(chosen[lane], function, take(tree, lane), *own))
+
+    def side_by_side(*lanes: Any) -> Any:  # noqa: ANN401 - arrays
+        return np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape))
+
+    return map_arrays(side_by_side, *results)
 
 
 def repeat(
@@ -150,16 +158,17 @@ def repeat(
     inside = with_leaves(tree, symbols)
     with frame() as faults:
         after = leaves_of(branch(condition(inside), function, inside))
-    outputs = [*(as_traced(leaf).flat() for leaf in after), faults.code]
-    once = _function(function, [symbol.buffer.content for symbol in symbols], outputs)
+    inputs = [symbol.buffer.content for symbol in symbols]
+    outputs = [as_traced(leaf).flat() for leaf in after]
+    once = _function(function, inputs, [*outputs, faults.code])
     columns = [as_traced(leaf).flat() for leaf in leaves]
     for _ in range(at_most):
         *columns, code = once(*columns)
         note_code(code)
-    shown = zip(columns, after, strict=True)
-    return with_leaves(
-        tree, [Traced.of(column, np.shape(leaf), as_traced(leaf).kind) for column, leaf in shown]
-    )
+    results = []
+    for column, leaf in zip(columns, after, strict=True):
+        results.append(Traced.of(column, np.shape(leaf), as_traced(leaf).kind))
+    return with_leaves(tree, results)
 
 
 def _function(function: Any, inputs: list[Any], outputs: list[Any]) -> Any:  # noqa: ANN401 - of CasADi

@@ -25,9 +25,8 @@ from servobench.fmus.trace.arrays import (
 )
 from servobench.fmus.trace.branches import NOT_DEFINITE, note_fault
 
-SWEEPS: Final = (
-    10  # sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors
-)
+# Sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors.
+SWEEPS: Final = 10
 ARRANGES: Final = frozenset(
     {
         np.reshape, np.swapaxes, np.moveaxis, np.transpose, np.diagonal, np.repeat, np.broadcast_to, np.flip,
@@ -46,13 +45,13 @@ def carry_out(
         NotTraceable: it has no expression.
     """
     if not _has_expressions([arguments, options]):
-        return function(
-            *map(as_numbers, arguments),
-            **{name: as_numbers(value) for name, value in options.items()},
-        )
+        plain_arguments = [as_numbers(value) for value in arguments]
+        plain_options = {name: as_numbers(value) for name, value in options.items()}
+        return function(*plain_arguments, **plain_options)
     if function in ARRANGES:
         first, *rest = arguments
-        return first.arranged(function(first.places, *rest, **options))
+        places = function(first.places, *rest, **options)
+        return first.arranged(places)
     if function not in FUNCTIONS:
         name = getattr(function, "__name__", str(function))
         raise NotTraceable(f"it calls numpy.{name}, which has no exported form")
@@ -62,14 +61,11 @@ def carry_out(
 def _has_expressions(value: Any) -> bool:  # noqa: ANN401 - any tree
     if isinstance(value, Traced):
         return not value.constant
-    values = (
-        value.values()
-        if isinstance(value, Mapping)
-        else value
-        if isinstance(value, (list, tuple))
-        else ()
-    )
-    return any(_has_expressions(each) for each in values)
+    if isinstance(value, Mapping):
+        return any(_has_expressions(each) for each in value.values())
+    if isinstance(value, (list, tuple)):
+        return any(_has_expressions(each) for each in value)
+    return False
 
 
 def _joining(function: Callable[..., Any]) -> Callable[..., Traced]:
@@ -102,15 +98,24 @@ def _reduction(name: str) -> Callable[..., Traced]:
     )
 
 
+def _last_axis(array: Any, axis: int | None) -> Traced:  # noqa: ANN401 - as numpy's
+    """Return an array with an axis moved to the end; all entries in one row for None."""
+    if axis is None:
+        return as_traced(np.ravel(array))
+    return as_traced(np.moveaxis(array, axis, -1))
+
+
 def _extreme(name: str) -> Callable[..., Traced]:
     """Return the function that finds the first entry along an axis that none exceeds by a comparison of its name."""
 
     def find(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
-        rows = as_traced(np.ravel(array) if axis is None else np.moveaxis(array, axis, -1))
-        best, place = rows[..., 0], Traced.plain(np.zeros(rows.shape[:-1], dtype=np.int_))
+        rows = _last_axis(array, axis)
+        best = rows[..., 0]
+        place = Traced.plain(np.zeros(rows.shape[:-1], dtype=np.int_))
         for k in range(1, rows.shape[-1]):
             exceeds = elementwise(name, rows[..., k], best)
-            best, place = choose(exceeds, rows[..., k], best), choose(exceeds, k, place)
+            best = choose(exceeds, rows[..., k], best)
+            place = choose(exceeds, k, place)
         place.kind = "i"
         return place
 
@@ -118,23 +123,30 @@ def _extreme(name: str) -> Callable[..., Traced]:
 
 
 def _cumsum(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
-    rows = as_traced(np.ravel(array) if axis is None else np.moveaxis(array, axis, -1))
-    sums = [rows[..., 0]]
+    rows = _last_axis(array, axis)
+    total = rows[..., 0]
+    sums = [total]
     for k in range(1, rows.shape[-1]):
-        sums.append(elementwise("add", sums[-1], rows[..., k]))
+        total = elementwise("add", total, rows[..., k])
+        sums.append(total)
     summed = _joining(np.stack)(sums, axis=-1)
-    return summed if axis is None else summed.arranged(np.moveaxis(summed.places, -1, axis))
+    if axis is None:
+        return summed
+    return summed.arranged(np.moveaxis(summed.places, -1, axis))
 
 
 def _take(array: Any, indices: Any, axis: int | None = None, **options: Any) -> Traced:  # noqa: ANN401 - as numpy's
     table = as_traced(array)
     if not isinstance(indices, Traced) or indices.constant:
-        return table.arranged(np.take(table.places, np.asarray(indices), axis=axis, **options))
+        places = np.take(table.places, np.asarray(indices), axis=axis, **options)
+        return table.arranged(places)
     if axis not in {None, 0}:
         raise NotTraceable(
             "it takes entries along an inner axis by an index that is known in the run only"
         )
-    return (table.reshape(-1) if axis is None else table)[indices]
+    if axis is None:
+        table = table.reshape(-1)
+    return table[indices]
 
 
 def _diff(array: Any, n: int = 1, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
@@ -145,29 +157,35 @@ def _diff(array: Any, n: int = 1, axis: int = -1) -> Traced:  # noqa: ANN401 - a
 
 
 def _clip(array: Any, a_min: Any = None, a_max: Any = None, **bounds: Any) -> Traced:  # noqa: ANN401 - as numpy's
-    low, high = bounds.get("min", a_min), bounds.get("max", a_max)
+    low = bounds.get("min", a_min)
+    high = bounds.get("max", a_max)
     result = as_traced(array)
-    result = result if low is None else elementwise("maximum", result, low)
-    return result if high is None else elementwise("minimum", result, high)
+    if low is not None:
+        result = elementwise("maximum", result, low)
+    if high is not None:
+        result = elementwise("minimum", result, high)
+    return result
 
 
 def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
-    one, other = as_traced(a), as_traced(b)
-    product: Traced = (
-        np.vecdot(one, other) if one.ndim == 1 == other.ndim else np.matmul(one, other)
-    )
+    one = as_traced(a)
+    other = as_traced(b)
+    of_vectors = one.ndim == 1 and other.ndim == 1
+    product: Traced = np.vecdot(one, other) if of_vectors else np.matmul(one, other)
     return product
 
 
 def _cross(a: Any, b: Any, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
-    one, other = (as_traced(np.moveaxis(each, axis, -1)) for each in (a, b))
+    one = as_traced(np.moveaxis(a, axis, -1))
+    other = as_traced(np.moveaxis(b, axis, -1))
     if {one.shape[-1], other.shape[-1]} != {3}:
         raise NotTraceable(
             "it calls numpy.cross, of which only products of three numbers each have an exported form"
         )
-    product = (
-        one[..., [1, 2, 0]] * other[..., [2, 0, 1]] - one[..., [2, 0, 1]] * other[..., [1, 2, 0]]
-    )
+    # y z′ − z y′, z x′ − x z′, x y′ − y x′
+    yzx = [1, 2, 0]
+    zxy = [2, 0, 1]
+    product = one[..., yzx] * other[..., zxy] - one[..., zxy] * other[..., yzx]
     return as_traced(np.moveaxis(product, -1, axis))
 
 
@@ -193,28 +211,32 @@ def each_matrix(function: Callable[..., tuple[Any, ...]], *arrays: Traced) -> li
         arrays: (..., m, n).
     """
     lead = np.broadcast_shapes(*(array.shape[:-2] for array in arrays))
-    stacks = (
-        spread(array, (*lead, *array.shape[-2:])).reshape(-1, *array.shape[-2:]) for array in arrays
-    )
-    results = [function(*map(_matrix, matrices)) for matrices in zip(*stacks, strict=True)]
-    columns = (
-        casadi.vertcat(*(casadi.vec(one.T) for one in stack))
-        for stack in zip(*results, strict=True)
-    )
-    return [
-        Traced.of(column, (*lead, *first.shape))
-        for column, first in zip(columns, results[0], strict=True)
-    ]
+    stacks = []
+    for array in arrays:
+        sizes = array.shape[-2:]
+        stacks.append(spread(array, (*lead, *sizes)).reshape(-1, *sizes))
+    results = []
+    for matrices in zip(*stacks, strict=True):
+        arguments = [_matrix(each) for each in matrices]
+        results.append(function(*arguments))
+    # One stack of matrices for each of the results of a call.
+    joined_results = []
+    for matrices in zip(*results, strict=True):
+        column = casadi.vertcat(*(casadi.vec(each.T) for each in matrices))
+        joined_results.append(Traced.of(column, (*lead, *matrices[0].shape)))
+    return joined_results
 
 
 def _matrix(array: Traced) -> Expression:
+    """Return an array (m, n) as a matrix of CasADi, which counts entries column by column."""
     rows, columns = array.shape
     return casadi.reshape(array.flat(), columns, rows).T
 
 
 def solve(A: Any, b: Any) -> Traced:  # noqa: ANN401 - anything array-like
     """Return A⁻¹ b, with b (..., n, k), or (n,)."""
-    left, right = as_traced(A), as_traced(b)
+    left = as_traced(A)
+    right = as_traced(b)
     if right.ndim == 1:
         return solve(left, right[:, None])[..., 0]
     return each_matrix(lambda one, other: (casadi.solve(one, other, "qr"),), left, right)[0]
@@ -230,22 +252,29 @@ def cholesky(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
     table = as_traced(A)
     factor = _cholesky(table.shape[-1])
     roots, least = each_matrix(factor, table)
-    note_fault(elementwise("logical_not", elementwise("greater", least, 0.0)), NOT_DEFINITE)
+    # A pivot that is NaN is not positive, either.
+    definite = elementwise("greater", least, 0.0)
+    note_fault(elementwise("logical_not", definite), NOT_DEFINITE)
     return roots
 
 
 @cache
 def _cholesky(size: int) -> Any:  # noqa: ANN401 - a function of CasADi
     """Return the function that gives L and the least pivot; NaN where there is none."""
-    A, L = casadi.SX.sym("A", size, size), casadi.SX.zeros(size, size)
+    A = casadi.SX.sym("A", size, size)
+    L = casadi.SX.zeros(size, size)
     least = casadi.SX(np.inf)
     for j in range(size):
-        pivot = A[j, j] - casadi.sumsqr(L[j, :j]) if j else A[j, j]
-        least = casadi.if_else(pivot < least, pivot, casadi.if_else(pivot >= least, least, pivot))
+        pivot = A[j, j]
+        if j > 0:
+            pivot = pivot - casadi.sumsqr(L[j, :j])
+        # A pivot that is NaN compares false with everything, and becomes the least one.
+        not_smaller = casadi.if_else(pivot >= least, least, pivot)
+        least = casadi.if_else(pivot < least, pivot, not_smaller)
         L[j, j] = casadi.sqrt(pivot)
         for i in range(j + 1, size):
-            done = casadi.dot(L[i, :j], L[j, :j]) if j else 0.0
-            L[i, j] = (A[i, j] - done) / L[j, j]
+            eliminated = casadi.dot(L[i, :j], L[j, :j]) if j else 0.0
+            L[i, j] = (A[i, j] - eliminated) / L[j, j]
     return casadi.Function(f"cholesky_{size}", [A], [casadi.densify(L), least])
 
 
@@ -294,9 +323,11 @@ def svd(a: Any, full_matrices: bool = True, compute_uv: bool = True) -> Svd | Tr
 @cache
 def _svd(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
     """Return the function that gives U (rows, columns), singular values and V of a tall matrix."""
-    sweep, sort = _sweep(rows, columns), _sorted(rows, columns)
+    sweep = _sweep(rows, columns)
+    sort = _sorted(rows, columns)
     A = casadi.MX.sym("A", rows, columns)
-    own, turned = A, casadi.MX(casadi.DM.eye(columns))
+    own = A
+    turned = casadi.MX(casadi.DM.eye(columns))
     for _ in range(SWEEPS):
         own, turned = sweep(own, casadi.densify(turned))
     return casadi.Function(f"svd_{rows}_{columns}", [A], list(sort(own, turned)))
@@ -304,50 +335,55 @@ def _svd(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
 
 def _sweep(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
     """Return the function that rotates each pair of columns once, and those of V alike."""
-    A, V = casadi.SX.sym("A", rows, columns), casadi.SX.sym("V", columns, columns)
-    own, turned = casadi.horzsplit(A), casadi.horzsplit(V)
+    A = casadi.SX.sym("A", rows, columns)
+    V = casadi.SX.sym("V", columns, columns)
+    own = casadi.horzsplit(A)
+    turned = casadi.horzsplit(V)
     for p, q in combinations(range(columns), 2):
         c, s = _rotation(own[p], own[q])
         for part in (own, turned):
-            part[p], part[q] = c * part[p] - s * part[q], s * part[p] + c * part[q]
-    return casadi.Function(
-        f"sweep_{rows}_{columns}", [A, V], [casadi.horzcat(*own), casadi.horzcat(*turned)]
-    )
+            one = part[p]
+            other = part[q]
+            part[p] = c * one - s * other
+            part[q] = s * one + c * other
+    outputs = [casadi.horzcat(*own), casadi.horzcat(*turned)]
+    return casadi.Function(f"sweep_{rows}_{columns}", [A, V], outputs)
 
 
 def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
     """Return the function that makes U, singular values and V of columns that are orthogonal."""
-    A, V = casadi.SX.sym("A", rows, columns), casadi.SX.sym("V", columns, columns)
-    own, turned = casadi.horzsplit(A), casadi.horzsplit(V)
+    A = casadi.SX.sym("A", rows, columns)
+    V = casadi.SX.sym("V", columns, columns)
+    own = casadi.horzsplit(A)
+    turned = casadi.horzsplit(V)
     sizes = [casadi.sqrt(casadi.sumsqr(column)) for column in own]
     for p, q in combinations(range(columns), 2):
         swapped = sizes[p] < sizes[q]
         for part in (own, turned, sizes):
-            one, other = part[p], part[q]
-            part[p], part[q] = (
-                casadi.if_else(swapped, other, one),
-                casadi.if_else(swapped, one, other),
-            )
-    left = [
-        casadi.if_else(size > 0.0, column / size, 0.0)
-        for column, size in zip(own, sizes, strict=True)
-    ]
-    if rows == columns == 3:  # a rotation also where the least value is only a rounding error
+            one = part[p]
+            other = part[q]
+            part[p] = casadi.if_else(swapped, other, one)
+            part[q] = casadi.if_else(swapped, one, other)
+    left = []
+    for column, size in zip(own, sizes, strict=True):
+        left.append(casadi.if_else(size > 0.0, column / size, 0.0))
+    if rows == columns == 3:
+        # U is orthogonal also where the least value is only a rounding error.
         across = casadi.cross(left[0], left[1])
-        left[2] = casadi.if_else(casadi.dot(across, left[2]) < 0.0, -across, across)
-    outputs = [casadi.horzcat(*left), casadi.vertcat(*sizes), casadi.horzcat(*turned)]
-    return casadi.Function(
-        f"sorted_{rows}_{columns}", [A, V], [casadi.densify(each) for each in outputs]
-    )
+        opposite = casadi.dot(across, left[2]) < 0.0
+        left[2] = casadi.if_else(opposite, -across, across)
+    factors = [casadi.horzcat(*left), casadi.vertcat(*sizes), casadi.horzcat(*turned)]
+    outputs = [casadi.densify(each) for each in factors]
+    return casadi.Function(f"sorted_{rows}_{columns}", [A, V], outputs)
 
 
 def _rotation(one: Expression, other: Expression) -> tuple[Expression, Expression]:
     """Return cosine and sine of the rotation that makes two columns orthogonal."""
     product = casadi.dot(one, other)
     zeta = (casadi.sumsqr(other) - casadi.sumsqr(one)) / (2.0 * product)
-    t = casadi.if_else(zeta >= 0.0, 1.0, -1.0) / (
-        casadi.fabs(zeta) + casadi.sqrt(1.0 + zeta * zeta)
-    )
+    # t = tan of the angle, the smaller root of t² + 2 ζ t − 1 = 0
+    sign = casadi.if_else(zeta >= 0.0, 1.0, -1.0)
+    t = sign / (casadi.fabs(zeta) + casadi.sqrt(1.0 + zeta * zeta))
     t = casadi.if_else(product == 0.0, 0.0, t)
     c = 1.0 / casadi.sqrt(1.0 + t * t)
     return c, c * t
@@ -358,7 +394,8 @@ def pseudo_inverse(a: Any) -> Traced:  # noqa: ANN401 - anything array-like
     U, values, Vh = svd(a, full_matrices=False)
     bound = 1e-15 * reduced("maximum", values, axis=-1, keepdims=True)
     large = elementwise("greater", values, bound)
-    inverted = choose(large, elementwise("divide", 1.0, choose(large, values, 1.0)), 0.0)
+    divisors = choose(large, values, 1.0)
+    inverted = choose(large, elementwise("divide", 1.0, divisors), 0.0)
     result: Traced = np.matmul(Vh.mT, inverted[..., None] * U.mT)
     return result
 

@@ -54,11 +54,9 @@ class _Numpy:
     @staticmethod
     def array(value: Any, dtype: Any = None, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
         same = _Numpy.asarray(value, dtype)
-        return (
-            same.copy()
-            if isinstance(same, Traced)
-            else np.array(value, dtype=_real(dtype), **options)
-        )
+        if isinstance(same, Traced):
+            return same.copy()
+        return np.array(value, dtype=_real(dtype), **options)
 
     @staticmethod
     def ascontiguousarray(value: Any) -> Any:  # noqa: ANN401 - as numpy's
@@ -82,18 +80,19 @@ class _Numpy:
 
     @staticmethod
     def take(array: Any, indices: Any, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
-        return np.take(
-            as_traced(array) if isinstance(indices, Traced) else array, indices, **options
-        )
+        if isinstance(indices, Traced):
+            array = as_traced(array)
+        return np.take(array, indices, **options)
 
     @staticmethod
     def broadcast_to(array: Any, shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
-        return spread(
-            as_traced(array), tuple(np.atleast_1d(shape)) if isinstance(shape, int) else shape
-        )
+        if isinstance(shape, int):
+            shape = (shape,)
+        return spread(as_traced(array), shape)
 
 
 def _real(dtype: Any) -> Any:  # noqa: ANN401 - as numpy's
+    """Return a type of numpy's; `float64` of recorded code is `_Numpy.float64`."""
     return np.float64 if dtype is _Numpy.float64 else dtype
 
 
@@ -117,10 +116,9 @@ def recording() -> Iterator[None]:
                     continue
                 space = vars(module)
                 for key, value in list(space.items()):
-                    unmemoised = (
-                        value.__wrapped__ if isinstance(value, _lru_cache_wrapper) else None
-                    )
-                    new = meanings.get(id(value), unmemoised)  # a memo must not keep expressions
+                    new = meanings.get(id(value))
+                    if new is None and isinstance(value, _lru_cache_wrapper):
+                        new = value.__wrapped__  # A memo must not keep expressions.
                     if new is not None:
                         changed.append((space, key, value))
                         space[key] = new
@@ -171,9 +169,8 @@ def record(
             values, u = _inputs(inputs)
             with frame() as faults:
                 first = start(own, values)
-            begin = casadi.Function(
-                "controller_start", [u], [_column(first), faults.code], {"cse": True}
-            )
+            outputs = [_column(first), faults.code]
+            begin = casadi.Function("controller_start", [u], outputs, {"cse": True})
             return Recorded(begin, _recorded_step(own, step, inputs, first))
     except NotTraceable as error:
         raise NotTraceable(f"{_where_it_failed(error)}: {error}") from error
@@ -199,24 +196,33 @@ def _recorded_step(
     new = leaves_of(state)
     if [np.shape(leaf) for leaf in new] != [np.shape(leaf) for leaf in leaves]:
         raise NotTraceable("its state has other sizes later than at the start")
-    x = casadi.MX.sym("x", sum(symbol.size for symbol in symbols))
-    parts = casadi.vertsplit(x, np.cumsum([0, *(symbol.size for symbol in symbols)]).tolist())
+    # All arrays of the state become parts of one column x.
+    ends = np.cumsum([0, *(symbol.size for symbol in symbols)]).tolist()
+    x = casadi.MX.sym("x", ends[-1])
+    parts = casadi.vertsplit(x, ends)
     results = [_column(state), as_traced(output).flat(), faults.code]
-    results = casadi.substitute(results, [symbol.buffer.content for symbol in symbols], parts)
+    arrays = [symbol.buffer.content for symbol in symbols]
+    results = casadi.substitute(results, arrays, parts)
     return casadi.Function("controller_step", [x, u], results, {"cse": True})
 
 
 def _inputs(inputs: Shapes) -> tuple[dict[str, Traced], Expression]:
+    """Return the inputs as arrays by name, and the column u of symbols that they are parts of."""
     u = casadi.MX.sym("u", sum(prod(shape) for shape, _ in inputs.values()))
-    values, begin = {}, 0
+    values = {}
+    first = 0
     for name, (shape, kind) in inputs.items():
-        part = u[begin : begin + prod(shape)]
-        values[name] = Traced.of(part != 0.0 if kind == "b" else part, shape, kind)
-        begin += prod(shape)
+        end = first + prod(shape)
+        part = u[first:end]
+        if kind == "b":
+            part = part != 0.0
+        values[name] = Traced.of(part, shape, kind)
+        first = end
     return values, u
 
 
 def _column(tree: Any) -> Expression:  # noqa: ANN401 - any tree
+    """Return all arrays of a tree as one column."""
     return casadi.vertcat(*(as_traced(leaf).flat() for leaf in leaves_of(tree)))
 
 
@@ -226,8 +232,7 @@ def _where_it_failed(error: BaseException) -> str:
     own = Path(__file__).parent
     for place, _ in walk_tb(error.__traceback__):
         code = place.f_code
-        if Path(code.co_filename).parent != own and "servobench" in str(
-            place.f_globals.get("__name__", "")
-        ):
+        module = str(place.f_globals.get("__name__", ""))
+        if Path(code.co_filename).parent != own and "servobench" in module:
             found = f"{code.co_qualname} in {inspect.getmodulename(code.co_filename)}"
     return found
