@@ -62,9 +62,8 @@ def this_platform() -> Platform:
     Raises:
         ValueError: FMUs cannot be built for it.
     """
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
-        platform.machine().lower(), platform.machine().lower()
-    )
+    processor = platform.machine().lower()
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(processor, processor)
     system = {"win32": "windows"}.get(sys.platform, sys.platform)
     name = f"{machine}-{system}"
     if name not in PLATFORMS:
@@ -97,7 +96,7 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
     """Compile `sources` in `folder` into the shared library `library`.
 
     Args:
-        folder: of the sources and headers; the compiler runs there, so that no path enters the library.
+        folder: folder of the sources and headers; the compiler runs there, so that no path enters the library.
         sources: file names.
         target: platform of the library.
         library: the file to write.
@@ -121,12 +120,10 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
         errors="replace",
     )
     if done.returncode != 0:
-        lines = [
-            line for line in done.stderr.splitlines() if "error" in line
-        ] or done.stderr.splitlines()
-        raise CompilationFailed(
-            f"{arguments[0]} failed for {target.name}: {lines[0] if lines else 'no message'}"
-        )
+        output_lines = done.stderr.splitlines()
+        errors = [line for line in output_lines if "error" in line]
+        first, *_ = errors or output_lines or ["no message"]
+        raise CompilationFailed(f"{arguments[0]} failed for {target.name}: {first}")
 
 
 def library_files(
@@ -162,7 +159,9 @@ def universal_library(slices: Sequence[bytes]) -> bytes:
         return slices[0]
     alignment = 14  # [bits], pages of 16 KiB, as Apple's processors have them
     page = 1 << alignment
-    header, body, end = struct.pack(">II", 0xCAFEBABE, len(slices)), b"", page
+    header = struct.pack(">II", 0xCAFEBABE, len(slices))
+    body = b""
+    end = page
     for content in slices:
         processor, variant = struct.unpack_from("<II", content, 4)
         header += struct.pack(">5I", processor, variant, end, len(content), alignment)
@@ -174,7 +173,9 @@ def universal_library(slices: Sequence[bytes]) -> bytes:
 def _words(command: str) -> list[str]:
     """Return the words of a command such as "gcc -m64"; a path with spaces that is a file is one word."""
     try:
-        return [command] if shutil.which(command) else shlex.split(command) or [command]
+        if shutil.which(command):
+            return [command]
+        return shlex.split(command) or [command]
     except ValueError:  # an unclosed quotation mark
         return [command]
 
@@ -183,7 +184,8 @@ def _compiler(target: Platform) -> list[str]:
     """Return the command that compiles for `target`: the system's compiler for this machine, zig for the others."""
     if target == this_platform():
         named = os.environ.get("CC", "").strip()
-        for command, *flags in [_words(named)] if named else [[each] for each in COMPILERS]:
+        candidates = [_words(named)] if named else [[each] for each in COMPILERS]
+        for command, *flags in candidates:
             path = shutil.which(command)
             if path is not None:
                 return [path, *flags]

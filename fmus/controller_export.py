@@ -18,8 +18,13 @@ from servobench.plant.contract.checks import FloatArray
 
 MODEL: Final = "controller"
 CORE: Final = "controller"
-POSITION, FEATURE, SEEN, REFERENCE = "joint_position", "feature", "seen", "reference"
-COMMAND, JACOBIAN = "joint_velocity_command", "jacobian"
+# Names of the variables.
+POSITION: Final = "joint_position"
+FEATURE: Final = "feature"
+SEEN: Final = "seen"
+REFERENCE: Final = "reference"
+COMMAND: Final = "joint_velocity_command"
+JACOBIAN: Final = "jacobian"
 
 
 def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]:
@@ -74,10 +79,9 @@ class ControllerModel:
     recorded: Recorded  # its step, of the columns [time, inputs]
     groups: tuple[Group, ...]  # from `controller_groups`
     period: float  # s
-    run: Mapping[
-        str, FloatArray
-    ]  # of the original: time, inputs and the outputs for them by name, (k, size)
-    settings: str  # of the original, for the documentation
+    # A run of the original: time, inputs and the outputs for them by name, (k, size).
+    run: Mapping[str, FloatArray]
+    settings: str  # settings of the original, for the documentation
 
     @property
     def identifier(self) -> str:
@@ -128,13 +132,15 @@ class ControllerModel:
         )
 
     def _constants(self, layout: Layout) -> dict[str, float]:
-        parts = self.recorded.start, self.recorded.step
+        """Return the sizes of arrays and work space, and the codes, that the C model needs."""
+        parts = (self.recorded.start, self.recorded.step)
+        pointers = [size for part in parts for size in (part.sz_arg(), part.sz_res())]
         return {
             "PERIOD": self.period,
             "N_MEMORY": max(self.recorded.states, 1),
             "N_FEATURES": layout.by_name[SEEN].size,
             "N_ANSWERS": sum(group.size for group in layout.of_role(SAMPLED)),
-            "N_POINTERS": max(size for part in parts for size in (part.sz_arg(), part.sz_res())),
+            "N_POINTERS": max(pointers),
             "N_WORK": max(1, *(part.sz_w() for part in parts)),
             "N_WHOLE_WORK": max(1, *(part.sz_iw() for part in parts)),
             "FAULT_NOT_DEFINITE": NOT_DEFINITE,
@@ -142,7 +148,7 @@ class ControllerModel:
 
     def _reference(self, layout: Layout) -> tuple[str, str]:
         """Return the run as CSV; the outputs at an instant, before its inputs, are those of the last one."""
-        before = {
-            name: np.pad(self.run[name][:-1], ((1, 0), (0, 0))) for name in (COMMAND, JACOBIAN)
-        }
+        before = {}
+        for name in (COMMAND, JACOBIAN):
+            before[name] = np.pad(self.run[name][:-1], ((1, 0), (0, 0)))
         return tables({**self.run, **before}, layout)

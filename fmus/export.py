@@ -28,7 +28,7 @@ MODEL = "ur5_mismatched"  # source folder; one C model serves every arm
 CORE = "kinematics"
 PACKAGES: Final = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
 SOURCES: Final = {".py", ".pyc", ".c", ".h", ".html", ".txt"}  # .pyc of an installation without .py
-STEP: Final = 0.05  # [s] of the default experiment
+STEP: Final = 0.05  # [s] step of the default experiment
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
 
@@ -48,15 +48,14 @@ class ExportOptions:
     """Options of an export."""
 
     fmi_version: int = 2  # 2 or 3; each has co-simulation and model exchange
-    # arm, cameras and home that become start values, and the step of default experiment and reference run
+    # Arm, cameras and home that become start values, and the step of default experiment and reference run.
     setup: PlantSetup = field(default_factory=nominal_setup)
-    config: KinematicConfig = field(default_factory=KinematicConfig)  # of lag, limits and mechanics
+    config: KinematicConfig = field(default_factory=KinematicConfig)  # lag, limits and mechanics
     platforms: tuple[Platform, ...] = field(
         default_factory=lambda: (this_platform(),)
-    )  # platforms to compile for
-    mismatch: str = (
-        "none"  # text for the documentation that says how the model differs from the nominal one
-    )
+    )  # to compile for
+    # Text for the documentation that says how the model differs from the nominal one.
+    mismatch: str = "none"
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
@@ -77,7 +76,8 @@ class ExportOptions:
     @property
     def view(self) -> View | None:
         """The sensing set-up; None for the ball in 3-D by a fixed camera."""
-        return View.of(self.model) if isinstance(self.model, SetupModel) else None
+        model = self.model
+        return View.of(model) if isinstance(model, SetupModel) else None
 
     @property
     def layout(self) -> ArmLayout:
@@ -87,34 +87,32 @@ class ExportOptions:
     @property
     def identifier(self) -> str:
         """Name of the libraries: that of the robot, and of another sensing than `position`, as a word of C."""
+        name = self.robot.name
         view = self.view
-        name = self.robot.name if view is None else f"{self.robot.name}_{view.word}"
+        if view is not None:
+            name = f"{name}_{view.word}"
         return f"{word(name, 'arm')}_mismatched"
 
     @property
     def title(self) -> str:
         """Name of the model."""
+        title = f"{self.robot.title} with mismatched kinematics"
         view = self.view
-        seen = (
-            ""
-            if view is None
-            else f", seen by {view.setup.name}{' on the hand' if view.mount == 'hand' else ''}"
-        )
-        return f"{self.robot.title} with mismatched kinematics{seen}"
+        if view is None:
+            return title
+        place = " on the hand" if view.mount == "hand" else ""
+        return f"{title}, seen by {view.setup.name}{place}"
 
     @property
     def summary(self) -> str:
         """The model in one sentence."""
-        title, view = self.robot.title, self.view
-        seen = (
-            "with a ball on its flange under a fixed camera"
-            if view is None
-            else f"and its cameras: {view.setting}"
-        )
-        return (
-            f"{'An' if title[:1] in set('AEIO') else 'A'} {title} {seen}; "
-            "every length, angle and offset is a tunable parameter."
-        )
+        title = self.robot.title
+        article = "An" if title[:1] in set("AEIO") else "A"
+        seen = "with a ball on its flange under a fixed camera"
+        view = self.view
+        if view is not None:
+            seen = f"and its cameras: {view.setting}"
+        return f"{article} {title} {seen}; every length, angle and offset is a tunable parameter."
 
 
 def export_fmu(path: Path, options: ExportOptions) -> Path:
@@ -136,8 +134,6 @@ def fingerprint(options: ExportOptions) -> str:
         CODE,
         options.platforms,
         options.fmi_version,
-    ]
-    parts += [
         options.title,
         options.identifier,
         options.summary,
@@ -148,15 +144,32 @@ def fingerprint(options: ExportOptions) -> str:
     digest = hashlib.sha256(repr(parts).encode())
     for name, values in parameters_of(options.setup, options.config).items():
         digest.update(name.encode() + np.asarray(values).tobytes())
-    files = (path for folder in PACKAGES for path in folder.rglob("*") if path.suffix in SOURCES)
-    for path in sorted(path for path in files if path.parent.name != "__pycache__"):
-        digest.update(str(path.relative_to(PACKAGES[0].parent)).encode() + path.read_bytes())
+    root = PACKAGES[0].parent
+    for path in _source_files():
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
     return digest.hexdigest()[:32]
+
+
+def _source_files() -> list[Path]:
+    """Return the files that an FMU is made from, sorted."""
+    paths = [path for folder in PACKAGES for path in folder.rglob("*")]
+    return sorted(
+        path for path in paths if path.suffix in SOURCES and path.parent.name != "__pycache__"
+    )
 
 
 def product(options: ExportOptions) -> Product:
     """Return the content of the FMU."""
-    layout, view = options.layout, options.view
+    layout = options.layout
+    seen = " carries a ball; a fixed camera sees it"
+    feature = "y = R_BC' (p_B(theta) - p_BC)"
+    view = options.view
+    if view is not None:
+        seen = f" and cameras: {view.setting}"
+        feature = PIXELS
+    mismatch = "the nominal model"
+    if options.mismatch != "none":
+        mismatch = f"the mismatch “{options.mismatch}”"
     return Product(
         fmi_version=options.fmi_version,
         folder=MODEL,
@@ -179,13 +192,9 @@ def product(options: ExportOptions) -> Product:
             title=options.title,
             summary=options.summary,
             joints=str(options.model.arm.n),
-            seen=f" and cameras: {view.setting}"
-            if view
-            else " carries a ball; a fixed camera sees it",
-            feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
-            mismatch="the nominal model"
-            if options.mismatch == "none"
-            else f"the mismatch “{options.mismatch}”",
+            seen=seen,
+            feature=feature,
+            mismatch=mismatch,
         ),
         reference=tables(reference_run(options.setup, options.config), layout),
     )

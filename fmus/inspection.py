@@ -38,8 +38,8 @@ class FmuInformation:
     """Content of an FMU."""
 
     description: Any  # the model description, as fmpy reads it
-    # those of co-simulation, model exchange and scheduled execution that it offers, each with the names of its
-    # capabilities
+    # The interfaces that it offers, co-simulation, model exchange and scheduled execution, each with the names of
+    # its capabilities.
     interfaces: Mapping[str, tuple[str, ...]]
     platforms: tuple[str, ...]  # folders below binaries/
     has_sources: bool  # whether it holds its C sources
@@ -52,10 +52,15 @@ def read_information(path: Path) -> FmuInformation:
         ValueError: it is not an FMU.
     """
     root = extract_fmu(path)
-    description, binaries = parse_description(path, root), root / "binaries"
-    platforms = sorted(item.name for item in binaries.iterdir()) if binaries.is_dir() else ()
+    binaries = root / "binaries"
+    platforms: list[str] = []
+    if binaries.is_dir():
+        platforms = sorted(item.name for item in binaries.iterdir())
     return FmuInformation(
-        description, _interfaces(root), tuple(platforms), (root / "sources").is_dir()
+        description=parse_description(path, root),
+        interfaces=_interfaces(root),
+        platforms=tuple(platforms),
+        has_sources=(root / "sources").is_dir(),
     )
 
 
@@ -69,26 +74,29 @@ INTERFACES = {
 def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
     """Return the capabilities by interface from the XML, since fmpy does not read all of FMI 3."""
     description = ET.parse(root / "modelDescription.xml").getroot()
-    elements = {name: description.find(tag) for tag, name in INTERFACES.items()}
-    return {
-        name: tuple(
-            key
-            for key, value in element.attrib.items()
-            if key.startswith(("can", "needs", "provides")) and value in ("true", "1")
-        )
-        for name, element in elements.items()
-        if element is not None
-    }
+    interfaces = {}
+    for tag, name in INTERFACES.items():
+        element = description.find(tag)
+        if element is None:
+            continue
+        capabilities = []
+        for key, value in element.attrib.items():
+            if key.startswith(("can", "needs", "provides")) and value in ("true", "1"):
+                capabilities.append(key)
+        interfaces[name] = tuple(capabilities)
+    return interfaces
 
 
 def shape_of(variable: Any) -> tuple[int, ...]:  # noqa: ANN401 - fmpy's classes carry no usable types
     """Return the sizes of the axes of a variable, as they are at its start; an axis of unknown size is left out."""
-    axes = variable.dimensions or ()
-    sizes = [
-        each.start if each.start is not None else getattr(each.variable, "start", None)
-        for each in axes
-    ]
-    return tuple(int(size) for size in sizes if size is not None)
+    sizes = []
+    for axis in variable.dimensions or ():
+        size = axis.start
+        if size is None:
+            size = getattr(axis.variable, "start", None)
+        if size is not None:
+            sizes.append(int(size))
+    return tuple(sizes)
 
 
 @dataclass(frozen=True)
@@ -96,12 +104,10 @@ class Validation:
     """Result of the checks."""
 
     problems: tuple[str, ...]  # one line for each; empty if there are none
-    departures: tuple[
-        str, ...
-    ]  # from the standard, one line for each, with which it runs here nevertheless
-    deviation: (
-        float | None
-    )  # largest difference from the reference run, or None without a reference run
+    # Departures from the standard, one line for each, with which it runs here nevertheless.
+    departures: tuple[str, ...]
+    # Largest difference from the reference run, or None without a reference run.
+    deviation: float | None
 
 
 def validate_fmu(path: Path) -> Validation:
@@ -123,9 +129,8 @@ def validate_fmu(path: Path) -> Validation:
             with closing(open_instance(description)) as instance:
                 instance.start(description.start_time)
     except (FmuError, ValueError) as error:
-        problems.append(
-            f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}"
-        )
+        failed = "the reference run failed" if referenced else "it cannot be made ready for a run"
+        problems.append(f"{failed}: {error}")
     if deviation is not None and not deviation <= TOLERANCE:
         problems.append(
             f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}"
@@ -168,17 +173,16 @@ def _deviation(description: FmuDescription) -> float:
     root = description.root
     header_in, commands = read_table((root / INPUT_FILE).read_text(encoding="utf-8"))
     header_out, wanted = read_table((root / OUTPUT_FILE).read_text(encoding="utf-8"))
-    inputs, outputs = (
-        Port(_variables(description, header_in)),
-        Port(_variables(description, header_out)),
-    )
-    if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (
-        len(commands),
-        outputs.values.size + 1,
-    ):
+    inputs = Port(_variables(description, header_in))
+    outputs = Port(_variables(description, header_out))
+    # The first column of a table is the time.
+    inputs_fit = commands.shape[1] == inputs.values.size + 1
+    outputs_fit = wanted.shape == (len(commands), outputs.values.size + 1)
+    if not inputs_fit or not outputs_fit:
         raise ValueError("the reference tables do not fit the FMU's variables")
     with closing(open_instance(description)) as instance:
-        write, read = instance.writer(inputs), instance.reader(outputs)
+        write = instance.writer(inputs)
+        read = instance.reader(outputs)
         times = commands[:, 0]
         instance.start(float(times[0]))
         came: FloatArray = np.empty_like(wanted[:, 1:])
@@ -188,17 +192,19 @@ def _deviation(description: FmuDescription) -> float:
             inputs.values[:] = commands[k, 1:]
             write()
             if k + 1 < len(times):
-                instance.stepper(float(times[k + 1] - time))(float(time))
-    size = np.maximum(1.0, np.abs(wanted[:, 1:]))  # pixels of a point beside a camera are large
-    return float((np.abs(came - wanted[:, 1:]) / size).max())
+                advance = instance.stepper(float(times[k + 1] - time))
+                advance(float(time))
+    # Differences of large numbers are relative: the pixels of a point beside a camera are large.
+    size = np.maximum(1.0, np.abs(wanted[:, 1:]))
+    difference = np.abs(came - wanted[:, 1:])
+    return float((difference / size).max())
 
 
 def _variables(description: FmuDescription, header: list[str]) -> list[Variable]:
     """Return the variables of the columns; in FMI 3 the columns `name[1]`, … belong to one array variable."""
     known = {variable.name for variable in description.variables}
     names = [name if name in known else name.partition("[")[0] for name in header[1:]]
-    return [
-        variable
-        for name in dict.fromkeys(names)
-        for variable in description.find(name, "reference run")
-    ]
+    variables: list[Variable] = []
+    for name in dict.fromkeys(names):
+        variables += description.find(name, "reference run")
+    return variables

@@ -35,6 +35,7 @@ HEADERS: Final = {
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
 ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
+UNIX: Final = 3  # system of an entry in a zip archive, which says how its mode is to be read
 PLACEHOLDER: Final = "{token}"
 RELATED_FILES: Final = (
     (
@@ -55,32 +56,30 @@ class Product:
     """The content of an FMU."""
 
     fmi_version: int  # 2 or 3
-    folder: str  # of the model below `fmus`, with model.c, model.h and license.txt
+    folder: str  # folder of the model below `fmus`, with model.c, model.h and license.txt
     core: str  # name of the generated C file and of its header in that folder
     source: str  # text of that C file
     constants: Mapping[str, float]  # for layout.h, beside sizes and offsets of the variables
-    description: Description  # of the model
+    description: Description  # description of the model
     documentation: str  # HTML
     reference: tuple[str, str]  # text of the reference run's inputs and outputs
 
     def sources(self) -> dict[str, str]:
         """Return the C files by their path in the archive, with a placeholder for the token."""
-        described, version_ = self.description, self.fmi_version
+        described = self.description
         machinery = (
             "model_functions.h",
             "instance.h",
             "instance.c",
             "shared_functions.h",
-            f"fmi{version_}.c",
+            f"fmi{self.fmi_version}.c",
         )
         texts = {name: committed(MACHINERY, name) for name in machinery}
-        texts |= {
-            name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")
-        }
-        texts |= {
-            name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8")
-            for name in HEADERS[version_]
-        }
+        for name in (f"{self.core}.h", "model.h", "model.c"):
+            texts[name] = committed(self.folder, name)
+        standard = files("fmpy") / "c-code"
+        for name in HEADERS[self.fmi_version]:
+            texts[name] = (standard / name).read_text(encoding="utf-8")
         texts[f"{self.core}.c"] = self.source
         texts["layout.h"] = layout_header(
             described.layout, described.start, self.constants, PLACEHOLDER
@@ -89,19 +88,19 @@ class Product:
 
     def descriptions(self, token: str) -> dict[str, bytes]:
         """Return the XML files by their path in the archive."""
-        files = {
-            "modelDescription.xml": write_description(self.description, self.fmi_version, token)
-        }
+        description = write_description(self.description, self.fmi_version, token)
+        contents = {"modelDescription.xml": description}
         if self.fmi_version == 3:
-            files["sources/buildDescription.xml"] = write_build_description(self.description)
-        return files
+            contents["sources/buildDescription.xml"] = write_build_description(self.description)
+        return contents
 
     def companions(self) -> dict[str, str]:
         """Return documentation, licence and reference run by their path in the archive."""
         inputs, outputs = self.reference
-        related = (
-            (f"../{file.removeprefix('extra/')}", role, text) for file, role, text in RELATED_FILES
-        )
+        related = []
+        for file, role, text in RELATED_FILES:
+            from_manifest = f"../{file.removeprefix('extra/')}"
+            related.append((from_manifest, role, text))
         return {
             INPUT_FILE: inputs,
             OUTPUT_FILE: outputs,
@@ -124,9 +123,8 @@ class Product:
             CompilerMissing: no compiler for one of the platforms.
             CompilationFailed: a compiler rejected the sources.
         """
-        contents = {
-            name: text.encode() for name, text in (self.sources() | self.companions()).items()
-        }
+        texts = self.sources() | self.companions()
+        contents = {name: text.encode() for name, text in texts.items()}
         token = _token(contents)
         layout_name = "sources/layout.h"
         contents[layout_name] = contents[layout_name].replace(PLACEHOLDER.encode(), token.encode())
@@ -138,12 +136,14 @@ class Product:
     def _libraries(
         self, contents: Mapping[str, bytes], platforms: tuple[Platform, ...]
     ) -> dict[str, bytes]:
+        """Return the libraries by their path in the archive, compiled from the sources among its files."""
         identifier = self.description.model_identifier
         with tempfile.TemporaryDirectory(prefix="servobench-export-") as name:
             folder = Path(name)
             (folder / "sources").mkdir()
-            for inside in (each for each in contents if each.startswith("sources/")):
-                (folder / inside).write_bytes(contents[inside])
+            for inside, content in contents.items():
+                if inside.startswith("sources/"):
+                    (folder / inside).write_bytes(content)
             libraries = {}
             for target in platforms:
                 library = folder / "library" / target.name / f"{identifier}{target.suffix}"
@@ -180,9 +180,8 @@ def documentation(folder: str, layout: Layout, **words: str) -> str:
         for group in layout.groups
     ]
     escaped = {name: html.escape(text) for name, text in words.items()}
-    return string.Template(committed(folder, "documentation.html")).substitute(
-        escaped, rows="\n".join(rows)
-    )
+    template = string.Template(committed(folder, "documentation.html"))
+    return template.substitute(escaped, rows="\n".join(rows))
 
 
 def word(text: str, otherwise: str) -> str:
@@ -212,7 +211,8 @@ def write_archive(
         with zipfile.ZipFile(partial, "w") as archive:
             for inside in sorted(contents, key=lambda name: (name != first, name)):
                 entry = zipfile.ZipInfo(inside, ZIP_EPOCH)
-                entry.compress_type, entry.create_system = zipfile.ZIP_DEFLATED, 3
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                entry.create_system = UNIX
                 entry.external_attr = 0o644 << 16
                 archive.writestr(entry, contents[inside], compresslevel=9)
 

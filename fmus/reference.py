@@ -26,31 +26,37 @@ def tables(run: Mapping[str, FloatArray], layout: Layout) -> tuple[str, str]:
         run: `time` in s, (k,), and variables by name, (k, size); each input is held over the step that begins then.
         layout: of the variables.
     """
-    others = {name: rows for name, rows in run.items() if name != "time"}
-    inputs = {
-        name: others.pop(name)
-        for name in run
-        if name in others and layout.by_name[name].role == INPUT
-    }
-    return table(run["time"], inputs, layout), table(run["time"], others, layout)
+    time = run["time"]
+    inputs = {}
+    others = {}
+    for name, rows in run.items():
+        if name == "time":
+            continue
+        if layout.by_name[name].role == INPUT:
+            inputs[name] = rows
+        else:
+            others[name] = rows
+    return table(time, inputs, layout), table(time, others, layout)
 
 
 def reference_run(setup: PlantSetup, config: KinematicConfig) -> dict[str, FloatArray]:
     """Return the reference run of the kinematic plant; some of its commands exceed the speed limit."""
     world = KinematicWorld(config, setup)
     limit = world.spec.command.upper
-    wanted = named_generator(0, "fmu_reference").uniform(
-        -1.2 * limit, 1.2 * limit, (STEPS + 1, world.spec.n)
-    )
+    generator = named_generator(0, "fmu_reference")
+    wanted = generator.uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, world.spec.n))
     rows = []
     for command in np.clip(wanted, -limit, limit):
-        state, feature, visible = world.save(), world.see(), world.visible()
+        state = world.save()
+        feature = world.see()
+        visible = world.visible()
         seen = np.ones_like(feature) if visible is None else visible.astype(np.float64)
         rows.append((state.q, state.v, feature, seen, state.q))
         world.advance(command)
     measured = FEATURE if isinstance(setup.model, SetupModel) else BALL
     names = ("joint_position", "joint_velocity", measured, SEEN, "encoder_position")
-    outputs = dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    outputs = dict(zip(names, columns, strict=True))
     return {
         "time": np.arange(STEPS + 1, dtype=np.float64) * setup.period,
         COMMAND: wanted,
@@ -77,8 +83,9 @@ def table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -
     """Return values by name, (k, size), as CSV with one column for each scalar."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["time", *(scalar for name in columns for scalar in layout.by_name[name].scalar_names())]
-    )
+    header = ["time"]
+    for name in columns:
+        header += layout.by_name[name].scalar_names()
+    writer.writerow(header)
     writer.writerows(np.column_stack([time, *columns.values()]).tolist())
     return text.getvalue()

@@ -61,31 +61,42 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
     """Return the mapping of the exported arm, with the true model of `setup` as its parameters, (..., size)."""
     model, _ = setup.robot()
     view = View.of(model) if isinstance(model, SetupModel) else None
-    lag, n = config.joint_lags or (config.lag,), model.arm.n
+    n = model.arm.n
+    lag = config.joint_lags or (config.lag,)
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
-    resolution, mechanics = config.encoder_resolution, config.mechanics
+    resolution = config.encoder_resolution
+    mechanics = config.mechanics
     mechanics.check(model)
     own = KinematicConfig(config.max_joint_speed, config.joint_range, mechanics=mechanics)
-    parameters = parameters_of(setup, own) | {
-        "lag": np.resize(lag, n),
-        "encoder_resolution": np.full(n, resolution),
-    }
+    parameters = parameters_of(setup, own)
+    parameters["lag"] = np.resize(lag, n)
+    parameters["encoder_resolution"] = np.full(n, resolution)
     del parameters["home"]
-    stops = (parameters[name] for name in ("max_speed", "joint_lower", "joint_upper"))
+    limits = JointLimits(
+        parameters["max_speed"], parameters["joint_lower"], parameters["joint_upper"]
+    )
+    joints = "encoder_position" if resolution > 0.0 else "joint_position"
+    features: tuple[str, ...] = (BALL,)
+    seen: tuple[str, ...] = ()
+    if view is not None:
+        features = (FEATURE,)
+        seen = (SEEN,)
+    # Only a single camera can be moved.
+    camera = None
+    if view is None or view.setup.cameras == 1:
+        camera = ("camera_position", "camera_rpy")
     return FmuMapping(
         file=path,
         inputs=("joint_velocity_command",),
-        joints=("encoder_position" if resolution > 0.0 else "joint_position",),
-        features=(BALL,) if view is None else (FEATURE,),
-        seen=() if view is None else (SEEN,),
+        joints=(joints,),
+        features=features,
+        seen=seen,
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
-        camera=("camera_position", "camera_rpy")
-        if view is None or view.setup.cameras == 1
-        else None,
+        camera=camera,
         parameters=parameters,
-        limits=JointLimits(*stops),
+        limits=limits,
         names=LogNames(model.arm.joint_names, model.channel.names, model.channel.unit),
     )
 
@@ -104,9 +115,8 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
     with configuration_errors("the FMU cannot be built: "):
         path = cached_fmu(config.fmi_version, setup.nominal, sensing)
     lag = float(np.mean(config.joint_lags or config.lag))
-    bench = build_fmu(
-        ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model
-    )
+    mapping = ur5_mapping(path, config, setup)
+    bench = build_fmu(mapping, setup, config.command_delay, config.sensing, lag, model)
     bench.world.mechanics = config.mechanics
     return bench
 
