@@ -119,7 +119,7 @@ class KinematicState(NamedTuple):
     v: FloatArray  # (..., n), rad/s
     a: FloatArray  # (..., n), rad/s², of joints with overshoot; else 0
     x: FloatArray  # (..., n), rad, behind the gears
-    tool: Tool  # of a flexible tool
+    tool: Tool  # deflection and velocity of a flexible tool
 
 
 class KinematicWorld(World):
@@ -133,26 +133,30 @@ class KinematicWorld(World):
                 without a ball.
         """
         model, start = setup.robot()
-        mechanics = self.mechanics = config.mechanics
+        mechanics = config.mechanics
+        self.mechanics = mechanics
         self.spec = hand_eye_spec(
             model, setup.period, config.max_joint_speed, config.joint_range, setup.limits
         )
-        rest, none = np.zeros(start.shape), np.zeros((*model.lead, 3))
+        rest = np.zeros(start.shape)
+        undeflected = np.zeros((*model.lead, 3))
         x = mechanics.transmitted(start) if mechanics.geared else start
-        self.lead, self._first = (
-            model.lead,
-            KinematicState(model, start, rest, rest, x, Tool(none, none)),
+        self.lead = model.lead
+        self._first = KinematicState(
+            model, q=start, v=rest, a=rest, x=x, tool=Tool(undeflected, undeflected)
         )
         self._model, self._q, self._v, self._a, self._x, self._tool = self._first
-        self._flexible, self._parts = mechanics.tool_frequency > 0.0, mechanics.parts(setup.period)
+        self._flexible = mechanics.tool_frequency > 0.0
+        self._parts = mechanics.parts(setup.period)
         self._part = setup.period / self._parts
         mechanics.check(model)
         self._config = config
         self._truth: Truth | None = None
         self._seen: BoolArray | None = None
-        self.lag, self.noise_unit = config.lag, model.noise_unit
+        self.lag = config.lag
+        self.noise_unit = model.noise_unit
         A, B = discretise_lag(config.lag, self._part)
-        self._coefficients = float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1])
+        self._coefficients = (float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1]))
 
     def reset(self, seed: Seeds) -> FloatArray:
         """Go back to the start at rest; nothing here is random."""
@@ -166,7 +170,8 @@ class KinematicWorld(World):
             self._follow(joint_velocity)
             self._x = self.mechanics.driven(self._x, self._q) if self.mechanics.geared else self._q
             if after is not None:
-                before, after = after, self._carried()
+                before = after
+                after = self._carried()
                 self._tool = self.mechanics.swung(self._tool, before, after, self._part)
         self._truth = None
         return self._q
@@ -174,18 +179,19 @@ class KinematicWorld(World):
     def _carried(self) -> Motion:
         """Return the motion of the ball of a rigid tool."""
         ball, jacobian = self._model.arm.ball_and_jacobian(self._x)
-        return ball, np.matvec(jacobian, self.mechanics.driven_velocity(self._x, self._q, self._v))
+        speed = self.mechanics.driven_velocity(self._x, self._q, self._v)
+        return ball, np.matvec(jacobian, speed)
 
     def _follow(self, joint_velocity: FloatArray) -> None:
         """Move the reported joints under a command (..., n), rad/s, for a part of the period."""
         from_v, kept, to_q, to_v = self._coefficients
         q = self._q + from_v * self._v + to_q * joint_velocity
         v = kept * self._v + to_v * joint_velocity
-        a, swings = self._a, self._config.overshoot > 0.0
+        a = self._a
+        swings = self._config.overshoot > 0.0
         if swings:
-            q, v, a = follow_with_overshoot(
-                (self._q, self._v, a), joint_velocity, self._config, self._part
-            )
+            joints = (self._q, self._v, a)
+            q, v, a = follow_with_overshoot(joints, joint_velocity, self._config, self._part)
         if not is_finite(q):
             q, v = self._rest(q, v)
         self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
@@ -207,17 +213,18 @@ class KinematicWorld(World):
         if self._truth is None:
             feature, jacobian, self._seen = self._model.observe(self._x)
             if self._flexible:
-                feature = feature + np.vecmat(
-                    self._tool.deflection, self._model.camera[..., :3, :3]
-                )
+                R_BC = self._model.camera[..., :3, :3]
+                feature = feature + np.vecmat(self._tool.deflection, R_BC)
             if self.mechanics.ripple > 0.0:
-                jacobian = jacobian * self.mechanics.slope(self._q)[..., None, :]
+                slope = self.mechanics.slope(self._q)
+                jacobian = jacobian * slope[..., None, :]
             self._truth = Truth(feature, jacobian)
         return self._truth
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
-        self._model, self._truth = self._model.with_camera(X_BC), None
+        self._model = self._model.with_camera(X_BC)
+        self._truth = None
 
     def save(self) -> KinematicState:
         """See `Plant.save`."""
@@ -226,11 +233,13 @@ class KinematicWorld(World):
     def restore(self, state: KinematicState) -> None:
         """See `Plant.restore`."""
         self._model, self._q, self._v, self._a, self._x, self._tool = state
-        self._truth, self.faults = None, {}
+        self._truth = None
+        self.faults = {}
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """See `Plant.keep`."""
-        self.lead, self._first = (len(lanes),), take(self._first, lanes)
+        self.lead = (len(lanes),)
+        self._first = take(self._first, lanes)
         self.restore(take(self.save(), lanes))
 
     def _rest(self, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:

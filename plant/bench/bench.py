@@ -50,9 +50,8 @@ class Timing:
     """Times of the bench in sub-steps of length h; sub-step i ends at the time i h."""
 
     steps: int  # in a control period, N
-    delays: tuple[
-        int, ...
-    ]  # [periods] age of the command that acts in each of the N sub-steps of a period
+    # [periods] Age of the command that acts in each of the N sub-steps of a period.
+    delays: tuple[int, ...]
     latency: int  # between exposure and delivery of a frame
     frames: (
         float  # between two exposures; a fraction where frames take no whole number of sub-steps
@@ -74,20 +73,23 @@ class Timing:
         """
         times = {"period": period, **delays_of(command_delay, sensing)}
         for name, value in times.items():
-            fits = _is_multiple(value, step) or (
-                name == "frame_period" and step < MAX_STEP + TIME_TOLERANCE
-            )
+            fits = _is_multiple(value, step)
+            # A camera keeps its mean rate: its frames are exposed after the nearest of short sub-steps.
+            if name == "frame_period" and step < MAX_STEP + TIME_TOLERANCE:
+                fits = True
             if not fits:
                 raise ValueError(
                     f"{name} must be a multiple of the world's period of {step:g} s, got {value:g} s"
                 )
-        steps, delay, latency, whole = (round(value / step) for value in times.values())
+        steps, delay, latency, whole_frames = (round(value / step) for value in times.values())
+        # ⌈(d − j)/N⌉
         delays = tuple(max(0, -((j - delay) // steps)) for j in range(steps))
         if sensing.frame_period == 0.0:
-            return cls(steps, delays, latency, steps, -latency % steps)
+            # One frame a period, delivered at a control instant.
+            return cls(steps, delays, latency, frames=steps, phase=-latency % steps)
         if _is_multiple(sensing.frame_period, step):
-            return cls(steps, delays, latency, whole or steps, 0)
-        return cls(steps, delays, latency, sensing.frame_period / step, 0)
+            return cls(steps, delays, latency, frames=whole_frames or steps, phase=0)
+        return cls(steps, delays, latency, frames=sensing.frame_period / step, phase=0)
 
     def exposes(self, step: int) -> bool:
         """Return whether a frame is exposed after sub-step number `step`."""
@@ -118,7 +120,8 @@ def common_step(period: float, command_delay: float, sensing: SensingConfig) -> 
     if all(_is_multiple(value, period) for value in times):
         return period
     if all(_is_multiple(value, 1e-3) for value in (period, *times)):
-        return math.gcd(*(round(1000.0 * value) for value in (period, *times))) / 1000.0
+        milliseconds = [round(1000.0 * value) for value in (period, *times)]
+        return math.gcd(*milliseconds) / 1000.0
     fewest = fewest_parts(period, MAX_STEP)
     for parts in range(1, 2 * fewest + 1):
         step = period / parts
@@ -156,9 +159,8 @@ def _is_multiple(value: float, step: float, tolerance: float = TIME_TOLERANCE) -
 class Frame(NamedTuple):
     """A frame on its way to the controller."""
 
-    due: (
-        int | FloatArray
-    )  # number of the sub-step after which it is delivered; with jitter, (...) and no whole number
+    # Number of the sub-step after which it is delivered; with jitter, (...) and no whole number.
+    due: int | FloatArray
     feature: FloatArray  # (..., m)
     valid: BoolArray  # (..., m), which features are measured and will arrive
 
@@ -172,9 +174,8 @@ class BenchState:
     frames: tuple[Frame, ...]  # frames under way, oldest first
     held: FloatArray  # (..., m), the last valid feature
     sensor: Sensor  # its random streams, and the outliers and occlusions that last
-    camera: (
-        FloatArray | None
-    )  # (..., 4, 4), pose at the start of a camera that turns; None of others
+    # (..., 4, 4), pose at the start of a camera that turns; None for others.
+    camera: FloatArray | None
     world: Any  # the saved state of the world
 
 
@@ -204,14 +205,16 @@ class Bench(Plant):
                 period, a camera that is to turn cannot be moved, or noise is in pixels and the features are not.
         """
         self.world = world
-        self._sensing, self._command_delay = sensing, command_delay
+        self._sensing = sensing
+        self._command_delay = command_delay
         spec = world.spec
         self._extents = sensing.extents(spec.feature.unit, world.noise_unit)
         self._period = spec.period if period is None else period
         self._step = spec.period
         self._timing = Timing.of(self._period, spec.period, command_delay, sensing)
         self.spec = spec if self._timing.steps == 1 else replace(spec, period=self._period)
-        self._lower, self._upper = spec.command.lower, spec.command.upper
+        self._lower = spec.command.lower
+        self._upper = spec.command.upper
         self._k = -1
         self._size_masks()
         self._camera = self._first_camera = camera if sensing.camera_turn > 0.0 else None
@@ -258,10 +261,12 @@ class Bench(Plant):
         rest.setflags(write=False)
         self._commands = deque([rest] * self._timing.delays[0])
         latency = self._timing.latency
-        # Before the start, and due after it
+        # Frames that were exposed before the start and are due after it.
         exposed = filter(self._timing.exposes, range(1 - latency, 1))
         self._frames = deque(Frame(step + latency, first, self._all_valid) for step in exposed)
-        self._held, self._k, self._camera = first, 0, self._first_camera
+        self._held = first
+        self._k = 0
+        self._camera = self._first_camera
         return self._observation(joints, first, self._all_valid)
 
     def step(self, command: Command) -> Observation:
@@ -277,37 +282,42 @@ class Bench(Plant):
         timing = self._timing
         for i, delay in enumerate(timing.delays, self._k * timing.steps + 1):
             if self._camera is not None:
-                self.world.move_camera(
-                    turned_about_axis(self._camera, self._sensing.camera_turn * i * self._step)
-                )
+                angle = self._sensing.camera_turn * i * self._step
+                self.world.move_camera(turned_about_axis(self._camera, angle))
             joints = self.world.advance(self._commands[-1 - delay])
             if timing.exposes(i):
                 self._frames.append(self._sent(i))
         self._commands.popleft()
         self._k += 1
-        return self._observation(joints, *self._delivered(self._k * timing.steps))
+        feature, valid = self._delivered(self._k * timing.steps)
+        return self._observation(joints, feature, valid)
 
     def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
         """Return the newest features that arrived since the last control instant, and which of them did, (..., m)."""
         if self._sensor.jitters:
             return self._delivered_by_lane(now)
-        feature, valid = self._held, self._none_valid
+        feature = self._held
+        valid = self._none_valid
         while self._frames and self._frames[0].due <= now:
             _, newer, own = self._frames.popleft()
             if own is self._all_valid:
-                feature, valid = newer, own
+                feature = newer
+                valid = own
             else:
-                feature, valid = np.where(own, newer, feature), np.logical_or(valid, own)
+                feature = np.where(own, newer, feature)
+                valid = np.logical_or(valid, own)
         return feature, valid
 
     def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
         """Return the same as `_delivered` for lanes whose frames are due at different times."""
-        feature, valid, before = self._held, self._none_valid, now - self._timing.steps
+        feature = self._held
+        valid = self._none_valid
+        before = now - self._timing.steps
         for due, newer, own in self._frames:
-            fresh = np.logical_and(
-                own, np.asarray(np.logical_and(before < due, due <= now))[..., None]
-            )
-            feature, valid = np.where(fresh, newer, feature), np.logical_or(valid, fresh)
+            arrives = np.asarray(np.logical_and(before < due, due <= now))
+            fresh = np.logical_and(own, arrives[..., None])
+            feature = np.where(fresh, newer, feature)
+            valid = np.logical_or(valid, fresh)
         while self._frames and np.all(self._frames[0].due <= now):
             self._frames.popleft()
         return feature, valid
@@ -316,7 +326,8 @@ class Bench(Plant):
         self, joints: FloatArray, feature: FloatArray, valid: BoolArray
     ) -> Observation:
         """Return the observation of the present period; features that do not arrive are held."""
-        time, whole = self._k * self._period, self._whole
+        time = self._k * self._period
+        whole = self._whole
         if valid is not self._all_valid:
             whole = np.logical_and.reduce(valid, axis=-1)
             valid.setflags(write=False)
@@ -327,28 +338,33 @@ class Bench(Plant):
 
     def _expose(self) -> FloatArray | None:
         """Return the feature as measured now, (..., m), with the sensor's disturbances; None if it is not found."""
-        feature, unit = self.world.see(), self.world.noise_unit
-        if feature is None or unit == 1.0:
-            return None if feature is None else self._sensor.measured(feature)
+        feature = self.world.see()
+        if feature is None:
+            return None
+        unit = self.world.noise_unit
+        if unit == 1.0:
+            return self._sensor.measured(feature)
         return unit * self._sensor.measured(feature / unit)
 
     def _unseen(self) -> BoolArray | None:
         """Return which features are not valid now, (..., m); None if all are valid."""
         seen = self.world.visible()
-        return None if seen is None or seen.all() else np.logical_not(seen)
+        if seen is None or seen.all():
+            return None
+        return np.logical_not(seen)
 
     def _sent(self, step: int) -> Frame:
         """Return the frame that is exposed after a sub-step, with which of its features will arrive."""
-        feature, missing, valid = (
-            self._expose(),
-            self._sensor.missing(step * self._step),
-            self._all_valid,
-        )
+        feature = self._expose()
+        missing = self._sensor.missing(step * self._step)
+        unseen = self._unseen()
+        valid = self._all_valid
         if feature is None:
-            feature, valid = self._held, self._none_valid
+            feature = self._held
+            valid = self._none_valid
         if missing is not None:
             valid = np.logical_and(valid, np.logical_not(missing)[..., None])
-        if (unseen := self._unseen()) is not None:
+        if unseen is not None:
             valid = np.logical_and(valid, np.logical_not(unseen))
         due: int | FloatArray = step + self._timing.latency
         if self._sensor.jitters:
@@ -362,8 +378,15 @@ class Bench(Plant):
     def save(self) -> BenchState:
         """See `Plant.save`."""
         sensor = copy.deepcopy(self._sensor)
-        under_way = tuple(self._commands), tuple(self._frames)
-        return BenchState(self._k, *under_way, self._held, sensor, self._camera, self.world.save())
+        return BenchState(
+            period=self._k,
+            commands=tuple(self._commands),
+            frames=tuple(self._frames),
+            held=self._held,
+            sensor=sensor,
+            camera=self._camera,
+            world=self.world.save(),
+        )
 
     def restore(self, state: BenchState) -> None:
         """See `Plant.restore`.
@@ -376,8 +399,11 @@ class Bench(Plant):
                 f"state must be of runs of shape {self.world.lead}, got {state.held.shape[:-1]}"
             )
         self.world.restore(state.world)
-        self._k, self._held, self._camera = state.period, state.held, state.camera
-        self._commands, self._frames = deque(state.commands), deque(state.frames)
+        self._k = state.period
+        self._held = state.held
+        self._camera = state.camera
+        self._commands = deque(state.commands)
+        self._frames = deque(state.frames)
         self._sensor = copy.deepcopy(state.sensor)
 
     @property
@@ -392,12 +418,12 @@ class Bench(Plant):
         self.world.keep(lanes)
         self._size_masks()
         self._sensor.keep(lanes)
-        commands, frames, self._held = take(
-            (tuple(self._commands), tuple(self._frames), self._held), lanes
-        )
-        self._commands, self._frames = deque(commands), deque(frames)
+        self._commands = deque(take(tuple(self._commands), lanes))
+        self._frames = deque(take(tuple(self._frames), lanes))
+        self._held = take(self._held, lanes)
         if self._camera is not None and self._first_camera is not None:
-            self._camera, self._first_camera = self._camera[lanes], self._first_camera[lanes]
+            self._camera = self._camera[lanes]
+            self._first_camera = self._first_camera[lanes]
 
     def true_model(self) -> TrueModel:
         """See `Plant.true_model`."""
@@ -405,18 +431,27 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        sensing, mechanics, symbolic = self._sensing, self.world.mechanics, model.symbolic
+        sensing = self._sensing
+        mechanics = self.world.mechanics
         if mechanics.ripple > 0.0:
-            a, k = mechanics.ripple, mechanics.ripple_order
-            jacobian = RippledJacobian(model.jacobian, mechanics)
+            a = mechanics.ripple
+            k = mechanics.ripple_order
+            symbolic = model.symbolic
             model = replace(
-                model, jacobian=jacobian, symbolic=lambda q: symbolic(q + a * (k * q).sin())
+                model,
+                jacobian=RippledJacobian(model.jacobian, mechanics),
+                symbolic=lambda q: symbolic(q + a * (k * q).sin()),
             )
         return replace(
-            model, latency=sensing.latency, command_delay=self._command_delay, lag=self.world.lag,
-            latency_spread=sensing.jitter + 2.0 * sensing.latency_swing, camera_turn=sensing.camera_turn,
+            model,
+            latency=sensing.latency,
+            # From no jitter to all of it, and from the least swing to the largest.
+            latency_spread=sensing.jitter + 2.0 * sensing.latency_swing,
+            command_delay=self._command_delay,
+            lag=self.world.lag,
+            camera_turn=sensing.camera_turn,
             tool=(mechanics.tool_frequency, mechanics.tool_damping),
-        )  # fmt: skip
+        )
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""
@@ -442,12 +477,13 @@ class Bench(Plant):
 
 def turned_about_axis(pose: FloatArray, angle: float) -> FloatArray:
     """Return poses (..., 4, 4) turned about their own z axis by an angle [rad]."""
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
+    x_axis = pose[..., 0]
+    y_axis = pose[..., 1]
     turned = np.array(pose)
-    turned[..., 0], turned[..., 1] = (
-        c * pose[..., 0] + s * pose[..., 1],
-        c * pose[..., 1] - s * pose[..., 0],
-    )
+    turned[..., 0] = c * x_axis + s * y_axis
+    turned[..., 1] = c * y_axis - s * x_axis
     return turned
 
 
@@ -478,10 +514,5 @@ def build_bench(
         remedy = "run.period, command_delay and latency that are multiples of its own step help"
         raise ValueError(f"{found}; {remedy}") from error
     command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
-    return Bench(
-        world,
-        command_delay,
-        sensing,
-        setup.period,
-        None if setup.model is None else setup.model.camera,
-    )
+    camera = None if setup.model is None else setup.model.camera
+    return Bench(world, command_delay, sensing, setup.period, camera)

@@ -69,8 +69,9 @@ class Sensor:
         Raises:
             ValueError: a negative seed.
         """
+        self._config = config
+        self.jitters = config.jitter > 0.0 or config.latency_swing > 0.0
         self._quantum = extents.quantum
-        self._config, self.jitters = config, config.jitter > 0.0 or config.latency_swing > 0.0
         self._scale = config.noise_factor * extents.feature_noise
         stream: Callable[..., Stream] = partial(Stream, seed)
         self._shape = np.array(config.noise_shape)
@@ -80,20 +81,16 @@ class Sensor:
             )
         self._noise = stream("feature_noise", family_of(config, extents), (m,), self._scale)
         share = np.random.Generator.random
-        self._losses, self._lateness = stream("dropped_frames", share), stream("late_frames", share)
-        self._outlier_begins, self._occlusion_begins = (
-            stream("outliers", share),
-            stream("occlusions", share),
-        )
+        self._losses = stream("dropped_frames", share)
+        self._lateness = stream("late_frames", share)
+        self._outlier_begins = stream("outliers", share)
+        self._occlusion_begins = stream("occlusions", share)
         self._outlier_values = stream("outlier_values", draw_directions, (m,), extents.outlier_size)
-        durations = config.outlier_duration, config.occlusion_duration
-        self._outlier_frames, self._occlusion_frames = (
-            max(1, round(each / interval)) for each in durations
-        )
-        self._outlier, self._occlusion = (
-            Spell.none(lead, np.zeros((*lead, m))),
-            Spell.none(lead, np.zeros(lead)[()]),
-        )
+        self._outlier_frames = max(1, round(config.outlier_duration / interval))
+        self._occlusion_frames = max(1, round(config.occlusion_duration / interval))
+        self._outlier = Spell.none(lead, np.zeros((*lead, m)))
+        self._occlusion = Spell.none(lead, np.zeros(lead)[()])
+        # Number of the sub-step after which the last frame is delivered.
         self._due: FloatArray = np.zeros(lead)[()]
 
     def measured(self, feature: FloatArray) -> FloatArray:
@@ -101,37 +98,37 @@ class Sensor:
         config = self._config
         if self._scale > 0.0:
             noise = self._noise.next()
-            feature = feature + (np.matvec(self._shape, noise) if self._shape.size else noise)
+            if self._shape.size:
+                noise = np.matvec(self._shape, noise)
+            feature = feature + noise
         if config.outliers > 0.0:
-            begins = self._outlier_begins.next() < begin_probability(
-                config.outliers, self._outlier_frames
-            )
-            self._outlier = self._outlier.next(
-                begins, self._outlier_frames, self._outlier_values.next()
-            )
+            probability = begin_probability(config.outliers, self._outlier_frames)
+            begins = self._outlier_begins.next() < probability
+            value = self._outlier_values.next()
+            self._outlier = self._outlier.next(begins, self._outlier_frames, value)
             feature = where(self._outlier.inside, feature + self._outlier.value, feature)
-        return quantise(feature, self._quantum) if self._quantum > 0.0 else feature
+        if self._quantum > 0.0:
+            feature = quantise(feature, self._quantum)
+        return feature
 
     def missing(self, time: float) -> BoolArray | None:
         """Return in which lanes the frame exposed at `time` [s] arrives without the feature, (...); None for none."""
-        config, absent = self._config, None
+        config = self._config
+        absent = None
         if config.drop_probability > 0.0:
             absent = self._losses.next() < config.drop_probability
         if config.occlusions > 0.0:
-            begins = self._occlusion_begins.next() < begin_probability(
-                config.occlusions, self._occlusion_frames
-            )
-            self._occlusion = self._occlusion.next(
-                begins, self._occlusion_frames, self._occlusion.value
-            )
-            absent = (
-                self._occlusion.inside
-                if absent is None
-                else np.logical_or(absent, self._occlusion.inside)
-            )
+            probability = begin_probability(config.occlusions, self._occlusion_frames)
+            begins = self._occlusion_begins.next() < probability
+            value = self._occlusion.value
+            self._occlusion = self._occlusion.next(begins, self._occlusion_frames, value)
+            hidden = self._occlusion.inside
+            absent = hidden if absent is None else np.logical_or(absent, hidden)
         if any(begin <= time + TIME_TOLERANCE < end for begin, end in config.occlusion_windows):
             absent = np.ones_like(self._occlusion.inside)[()]
-        return absent if absent is not None and absent.any() else None
+        if absent is None or not absent.any():
+            return None
+        return absent
 
     def due(self, step: int, latency: int, size: float) -> FloatArray:
         """Return the sub-step after which a frame is delivered, (...), a fraction.
@@ -142,14 +139,12 @@ class Sensor:
             size: of a sub-step, s.
         """
         config = self._config
-        swing = (
-            config.latency_swing
-            / size
-            * (1.0 + math.sin(2.0 * math.pi * step * size / config.swing_period))
-        )
-        self._due = np.maximum(
-            self._due, step + latency + swing + config.jitter / size * self._lateness.next()
-        )
+        phase = 2.0 * math.pi * step * size / config.swing_period
+        swing = config.latency_swing / size * (1.0 + math.sin(phase))
+        jitter = config.jitter / size * self._lateness.next()
+        due = step + latency + swing + jitter
+        # Frames do not overtake each other.
+        self._due = np.maximum(self._due, due)
         return self._due
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
@@ -157,8 +152,9 @@ class Sensor:
         for part in vars(self).values():
             if isinstance(part, Stream):
                 part.keep(lanes)
-        state = self._outlier, self._occlusion, self._due
-        self._outlier, self._occlusion, self._due = take(state, lanes)
+        self._outlier = take(self._outlier, lanes)
+        self._occlusion = take(self._occlusion, lanes)
+        self._due = take(self._due, lanes)
 
 
 def begin_probability(share: float, frames: int) -> float:
@@ -181,7 +177,9 @@ class Spell(NamedTuple):
     @classmethod
     def none(cls, lead: tuple[int, ...], value: FloatArray) -> Spell:
         """Return the state before the first frame, outside of any spell."""
-        return cls(np.zeros(lead, dtype=np.int_)[()], np.zeros(lead, dtype=np.bool_)[()], value)
+        left = np.zeros(lead, dtype=np.int_)[()]
+        inside = np.zeros(lead, dtype=np.bool_)[()]
+        return cls(left, inside, value)
 
     def next(self, begins: BoolArray, frames: int, value: FloatArray) -> Spell:
         """Return the state at the next frame.
@@ -194,4 +192,5 @@ class Spell(NamedTuple):
         goes_on = self.left > 0
         new = np.logical_and(begins, np.logical_not(goes_on))
         left = np.where(new, frames - 1, np.maximum(self.left - 1, 0))[()]
-        return Spell(left, np.logical_or(goes_on, new), where(new, value, self.value))
+        inside = np.logical_or(goes_on, new)
+        return Spell(left, inside, where(new, value, self.value))

@@ -155,9 +155,9 @@ ANGLE: Final = {"deg": math.pi / 180.0, "rad": 1.0}
 class SensorAxis(NamedTuple):
     """A word for one setting of a sensor."""
 
-    # its units with their sizes in SI units, NaN of pixels; the empty one for a plain number
+    # Its units with their sizes in SI units, NaN for pixels; the empty one is for a plain number.
     units: Mapping[str, float]
-    example: str  # of a magnitude
+    example: str  # an example of a magnitude
     setting: str  # its key in `SensingConfig`
     family: Family | None = None  # the family of noise that it chooses; None for none
 
@@ -190,9 +190,9 @@ def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, f
     changes = {}
     for name, written, size in axes:
         axis = SENSOR_AXES[name]
-        check_field(
-            name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size
-        )
+        # Shares and plain numbers are checked as they were written, for the sake of messages.
+        given = written if axis.units in (SHARE, NUMBER) else size
+        check_field(name, SensingConfig, axis.setting, given)
         changes[axis.setting] = size
         if axis.family is not None:
             if "noise" in changes:
@@ -228,9 +228,9 @@ def mixture(
         spread: κ, deviation of the second one.
     """
     second = generator.random(shape) < share
-    return np.where(second, spread, 1.0) * generator.standard_normal(shape) + np.where(
-        second, offset, 0.0
-    )
+    deviation = np.where(second, spread, 1.0)
+    mean = np.where(second, offset, 0.0)
+    return deviation * generator.standard_normal(shape) + mean
 
 
 def bimodal(
@@ -245,7 +245,8 @@ def bimodal(
         offset: μ, its size.
     """
     chance = generator.random(shape)
-    side = np.where(chance < share / 2.0, 1.0, np.where(chance < share, -1.0, 0.0))
+    not_above = np.where(chance < share, -1.0, 0.0)
+    side = np.where(chance < share / 2.0, 1.0, not_above)
     return generator.standard_normal(shape) + offset * side
 
 
@@ -269,17 +270,22 @@ def stable(
         stability: α, above 0 up to 2.
         skewness: β, from −1 to 1.
     """
-    a, b, gamma = stability, skewness, math.sqrt(0.5)
+    a = stability
+    b = skewness
+    gamma = math.sqrt(0.5)  # scale
     V = math.pi * (generator.random(shape) - 0.5)
     W = np.maximum(-np.log1p(-generator.random(shape)), TINY)
     if a == 1.0:
         slope = np.maximum(math.pi / 2.0 + b * V, TINY)
-        Z = slope * np.tan(V) - b * np.log(math.pi / 2.0 * W * np.cos(V) / slope)
+        logarithm = np.log(math.pi / 2.0 * W * np.cos(V) / slope)
+        Z = slope * np.tan(V) - b * logarithm
+        # In this parametrisation a scale γ shifts the numbers as well, by 2/π β γ ln γ.
         return np.asarray(gamma * 2.0 / math.pi * (Z + b * math.log(gamma)))
     theta = math.atan(b * math.tan(math.pi * a / 2.0)) / a
     turned = a * (V + theta)
-    Z = np.sin(turned) / (math.cos(a * theta) * np.cos(V)) ** (1.0 / a)
-    return np.asarray(gamma * Z * (np.maximum(np.cos(V - turned), TINY) / W) ** ((1.0 - a) / a))
+    first = np.sin(turned) / (math.cos(a * theta) * np.cos(V)) ** (1.0 / a)
+    second = np.maximum(np.cos(V - turned), TINY) / W
+    return np.asarray(gamma * first * second ** ((1.0 - a) / a))
 
 
 def uniform(generator: np.random.Generator, shape: Shape) -> FloatArray:
@@ -289,7 +295,8 @@ def uniform(generator: np.random.Generator, shape: Shape) -> FloatArray:
 
 def family_of(config: SensingConfig, extents: Extents) -> Draw:
     """Return the noise of a sensor with settings `config`, in multiples of its deviation σ; a row for each family."""
-    share, offset = config.noise_share, 0.0
+    share = config.noise_share
+    offset = 0.0
     if extents.feature_noise > 0.0:
         offset = extents.noise_offset / extents.feature_noise
     families: dict[Family, Draw] = {
