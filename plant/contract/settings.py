@@ -71,6 +71,15 @@ class Usual:
     size: float
     least: float = 0.0
 
+    def bound_beyond(self, number: float) -> str:
+        """Return the bound that a number lies beyond, in words; empty for a number of usual size."""
+        size = abs(number)
+        if size > self.size:
+            return f"at most {self.size:g}"
+        if 0.0 < size < self.least:
+            return f"at least {self.least:g}"
+        return ""
+
 
 Number: TypeAlias = Annotated[float, AllowInfNan(False)]
 """A finite number."""
@@ -111,12 +120,11 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - as read from a file
 
 
 def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
-    parts = split_quantity(value) if isinstance(value, str) else (value, "")
-    number = (
-        parts[0]
-        if parts is not None and parts[1] == ("px" if isinstance(value, str) else "")
-        else None
-    )
+    number: Any = value
+    if isinstance(value, str):
+        parts = split_quantity(value)
+        in_pixels = parts is not None and parts[1] == "px"
+        number = parts[0] if parts is not None and in_pixels else None
     if not isinstance(number, int | float) or isinstance(number, bool) or not math.isfinite(number):
         raise PydanticCustomError("extent", "a number of metres or a text such as '2px'")
     if number < 0.0:
@@ -152,7 +160,7 @@ File: TypeAlias = Annotated[
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
-REMARKS: Final[list[str]] = []  # of this worker process
+REMARKS: Final[list[str]] = []  # remarks that this worker process keeps for its parent
 MAX_LISTED = 40  # number of names in an error message
 _BOUNDS = {
     "greater_than": ("gt", "above", operator.gt),
@@ -161,7 +169,7 @@ _BOUNDS = {
     "less_than_equal": ("le", "at most", operator.le),
 }
 STORED_STRINGS: Final = Path(__file__).parents[1] / "data" / "field_strings.json"
-UNIT: Final = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the begin of a string below a field
+UNIT: Final = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the beginning of a string below a field
 _WANTED = {
     "finite_number": "finite",
     "float_type": "a number",
@@ -182,12 +190,15 @@ def settings(kind: Class) -> Class:
     Construction raises a `ValueError` of one line that names the field, the wanted and the given value.
     """
     checked: Any = dataclass(frozen=True, config=STRICT)(kind)
-    construct, names = checked.__init__, [item.name for item in fields(checked)]
+    construct = checked.__init__
+    names = [item.name for item in fields(checked)]
 
     @wraps(construct)
     def construct_checked(self: Any, *arguments: Any, **values: Any) -> None:  # noqa: ANN401 - any field
         try:
-            construct(self, **dict(zip(names, arguments, strict=False)), **values)
+            # By name, so that a complaint names the field and not the number of an argument.
+            named = dict(zip(names, arguments, strict=False))
+            construct(self, **named, **values)
         except ValidationError as error:
             raise ValueError(describe(error)) from None
 
@@ -235,14 +246,19 @@ def suggest(word: str, known: Iterable[str]) -> str:
     """Return a remedy for an unknown word: the nearest known one, then all of them, or the first of many."""
     names = sorted(known)
     near = nearest(word, names)
-    return f"{f'did you mean {near!r}? ' if near else ''}valid: {listed(names)}"
+    remedy = f"valid: {listed(names)}"
+    if near:
+        remedy = f"did you mean {near!r}? {remedy}"
+    return remedy
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """Return the known word that is most like a possibly mistyped word; None if none is like it."""
     by_letters = {each.lower(): each for each in known}
     near = difflib.get_close_matches(word.lower(), by_letters, n=1)
-    return by_letters[near[0]] if near else None
+    if not near:
+        return None
+    return by_letters[near[0]]
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -253,8 +269,10 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 def listed(names: Sequence[str], most: int = MAX_LISTED) -> str:
     """Return names with commas between them, or the first of many."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"{', '.join(names[:most])}{more}"
+    first = ", ".join(names[:most])
+    if len(names) <= most:
+        return first
+    return f"{first} and {len(names) - most} more"
 
 
 def _suggest_setting(key: str, section: object) -> str:
@@ -263,15 +281,20 @@ def _suggest_setting(key: str, section: object) -> str:
     for name in known:
         part = getattr(section, name)
         if is_dataclass(part) and key in (item.name for item in fields(part)):
-            return f"did you mean {f'{name}.{key}'!r}?"
-    return suggest(key, known) if known else "it has none"
+            place = f"{name}.{key}"
+            return f"did you mean {place!r}?"
+    if not known:
+        return "it has none"
+    return suggest(key, known)
 
 
 def with_tuples(value: Any) -> Any:  # noqa: ANN401 - any value of TOML
     """Return a value with tuples for lists, at any depth."""
     if isinstance(value, dict):
         return {key: with_tuples(each) for key, each in value.items()}
-    return tuple(map(with_tuples, value)) if isinstance(value, list) else value
+    if isinstance(value, list):
+        return tuple(with_tuples(each) for each in value)
+    return value
 
 
 @plain_dataclass(frozen=True)
@@ -285,24 +308,29 @@ class Check:
     @classmethod
     def of(cls, hint: Any, *, bare: bool = False) -> Self:  # noqa: ANN401 - any annotation
         """Return the check of an annotation, which may have a `Usual`."""
-        return cls(TypeAdapter(hint, config=STRICT), _usual(hint) or Usual(math.inf), bare)
+        adapter = TypeAdapter(hint, config=STRICT)
+        usual = _usual(hint) or Usual(math.inf)
+        return cls(adapter, usual, bare)
 
 
 @cache
 def _checks(kind: type) -> dict[str, Check]:
     """Return the check of each field that is not a section."""
     hints = get_type_hints(kind, include_extras=True)
-    return {
-        item.name: Check.of(hints[item.name])
-        for item in fields(kind)
-        if not is_dataclass(hints[item.name])
-    }
+    checks = {}
+    for item in fields(kind):
+        hint = hints[item.name]
+        if not is_dataclass(hint):
+            checks[item.name] = Check.of(hint)
+    return checks
 
 
 @cache
 def _unit(kind: type, key: str) -> str:
-    """Return the unit of a field; empty where none is told."""
-    return UNIT.fullmatch(field_strings(kind).get(key, ""))[1] or ""  # type: ignore[index]
+    """Return the unit of a field; empty where its string names none."""
+    text = field_strings(kind).get(key, "")
+    found = UNIT.fullmatch(text)
+    return (found and found[1]) or ""
 
 
 @cache
@@ -312,20 +340,21 @@ def field_strings(kind: type[Any]) -> dict[str, str]:
     for each in reversed(kind.__mro__[:-1]):
         try:
             source = inspect.getsource(each)
-        except (
-            OSError,
-            TypeError,
-        ):  # The class was typed in, is not written in Python, or came without its source.
+        except (OSError, TypeError):
+            # The class was typed in, is not written in Python, or came without its source.
             strings |= _stored_strings().get(f"{each.__module__}.{each.__qualname__}", {})
             continue
-        strings |= strings_in(ast.parse(textwrap.dedent(source)).body[0])
+        definition = ast.parse(textwrap.dedent(source)).body[0]
+        strings |= strings_in(definition)
     return strings
 
 
 def strings_in(definition: ast.stmt) -> dict[str, str]:
     """Return the strings below the fields of a class in its syntax tree, as one line each, by field."""
-    strings = {}
-    for item, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
+    strings: dict[str, str] = {}
+    if not isinstance(definition, ast.ClassDef):
+        return strings
+    for item, below in pairwise(definition.body):
         match item, below:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
                 value=ast.Constant(value=str(text))
@@ -346,9 +375,9 @@ def _stored_strings() -> dict[str, dict[str, str]]:
 
 def check_field(name: str, kind: type[Any], key: str, given: object) -> Any:  # noqa: ANN401 - any setting
     """Return the checked value of a field of a settings class, which is no section; see `read_value`."""
-    return read_value(
-        name, given, _checks(cast(Any, kind))[key], partial(_unit, cast(Any, kind), key)
-    )
+    settings_class = cast(Any, kind)
+    check = _checks(settings_class)[key]
+    return read_value(name, given, check, partial(_unit, settings_class, key))
 
 
 def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) -> Any:  # noqa: ANN401 - as checked
@@ -368,16 +397,21 @@ def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) 
         value = check.type.validate_python(_in_own_unit(name, written, unit))
     except ValidationError as error:
         raise ValueError(describe(error, name, written, unit(), bare=check.bare)) from None
-    least, most = check.usual.least, check.usual.size
-    for number in [
-        each for each in _numbers_in(value) if abs(each) > most or 0.0 < abs(each) < least
-    ][:1]:
-        meant = likely_meant(
-            number, unit(), lambda other: least <= abs(other) <= most, bare=check.bare
-        )
-        bound = f"at most {most:g}" if abs(number) > most else f"at least {least:g}"
-        remark(f"{name} is {number:g}, and usually {f'{bound} {unit()}'.removesuffix(' 1')}{meant}")
+    for number in _numbers_in(value):
+        if check.usual.bound_beyond(number):
+            _remark_unusual(name, number, check, unit())
+            break  # One remark for a list is enough.
     return value
+
+
+def _remark_unusual(name: str, number: float, check: Check, unit: str) -> None:
+    """Remark on a number of unusual size, with the unit in which it may have been meant."""
+    usual = check.usual
+    meant = likely_meant(
+        number, unit, lambda other: usual.least <= abs(other) <= usual.size, bare=check.bare
+    )
+    bound = f"{usual.bound_beyond(number)} {unit}".removesuffix(" 1")
+    remark(f"{name} is {number:g}, and usually {bound}{meant}")
 
 
 @cache
@@ -393,26 +427,40 @@ def _in_own_unit(name: str, written: object, unit: Callable[[], str]) -> object:
     """Return numbers in place of texts that are numbers with a unit."""
     if isinstance(written, tuple):
         return tuple(_in_own_unit(name, each, unit) for each in written)
-    parts = split_quantity(written) if isinstance(written, str) else None
-    if parts is None or not unit() or (unit() == EXTENT and parts[1] == "px"):
+    if not isinstance(written, str):
         return written
-    if "/" in str(written) and not parts[1]:
-        return parts[0]
+    parts = split_quantity(written)
+    if parts is None:
+        return written
+    number, written_unit = parts
+    own = unit()
+    if not own:
+        return written
+    if own == EXTENT and written_unit == "px":
+        return written
+    if "/" in written and not written_unit:
+        return number
     try:
-        number = in_own_unit(*parts, unit())
+        in_own = in_own_unit(number, written_unit, own)
     except ValueError as error:
         raise ValueError(f"{name} must be {error}, got {written!r}") from None
-    return int(number) if number.is_integer() else number
+    # A whole number passes a check for whole numbers as well.
+    return int(in_own) if in_own.is_integer() else in_own
 
 
 def _usual(hint: Any) -> Usual | None:  # noqa: ANN401 - any annotation
     """Return the usual sizes in an annotation, or in that of its items."""
-    found = (each if isinstance(each, Usual) else _usual(each) for each in get_args(hint))
-    return next(filter(None, found), None)
+    for each in get_args(hint):
+        found = each if isinstance(each, Usual) else _usual(each)
+        if found:
+            return found
+    return None
 
 
 def _numbers_in(value: object) -> Iterator[float]:
-    value = tuple(np.ravel(value).tolist()) if isinstance(value, np.ndarray) else value
+    """Yield the numbers of a value: itself, or those in an array or in tuples at any depth."""
+    if isinstance(value, np.ndarray):
+        value = tuple(np.ravel(value).tolist())
     if isinstance(value, tuple):
         for each in value:
             yield from _numbers_in(each)
@@ -425,12 +473,12 @@ def likely_meant(
 ) -> str:
     """Return the remedy for a plain number that may have been meant in another unit, such as millimetres."""
     meant = {text: f"{value:.6g}" for text, value in alternatives(number, unit) if fits(value)}
-    wanted = (
-        f"{' or '.join(meant.values())}, as units cannot be written here"
-        if bare
-        else "the unit, too"
-    )
-    return f"; if {' or '.join(meant)} is meant, write {wanted}" if meant else ""
+    if not meant:
+        return ""
+    wanted = "the unit, too"
+    if bare:
+        wanted = f"{' or '.join(meant.values())}, as units cannot be written here"
+    return f"; if {' or '.join(meant)} is meant, write {wanted}"
 
 
 def native(value: Any) -> Any:  # noqa: ANN401 - anything that a user gave
@@ -459,19 +507,27 @@ def describe(
     for place in first["loc"]:
         if isinstance(written, tuple) and isinstance(place, int) and place < len(written):
             written = written[place]
-    name = ".".join([name] * bool(name) + [str(part) for part in first["loc"]])
-    kind, context, came = first["type"], first.get("ctx", {}), native(first["input"])
+    places = [str(part) for part in first["loc"]]
+    if name:
+        places.insert(0, name)
+    name = ".".join(places)
+    kind = first["type"]
+    context = first.get("ctx", {})
+    came = native(first["input"])
     if kind == "value_error":
         return " ".join(str(context["error"]).split())
     if kind in _BOUNDS:
         key, word, within = _BOUNDS[kind]
+        bound = context[key]
         if isinstance(written, str) and (parts := split_quantity(written)) and parts[1]:
-            return f"{name} must be {word} {in_unit(context[key], parts[1], unit):g}{parts[1]}, got {written}"
-        meant = likely_meant(came, unit, lambda other: within(other, context[key]), bare=bare)
-        return f"{name} must be {word} {context[key]:g}, got {came!r}{meant}"
+            written_unit = parts[1]
+            return f"{name} must be {word} {in_unit(bound, written_unit, unit):g}{written_unit}, got {written}"
+        meant = likely_meant(came, unit, lambda other: within(other, bound), bare=bare)
+        return f"{name} must be {word} {bound:g}, got {came!r}{meant}"
     if kind == "literal_error":
         words = context["expected"].replace("'", "").replace(" or ", ", ")
-        return f"{name} must be one of {words}, got {came!r}{did_you_mean(str(came), words.split(', '))}"
+        remedy = did_you_mean(str(came), words.split(", "))
+        return f"{name} must be one of {words}, got {came!r}{remedy}"
     if kind == "too_short":
         wanted = f"of length {context['min_length']} or more"
     elif kind in {"unexpected_keyword_argument", "missing"}:
