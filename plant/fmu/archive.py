@@ -19,8 +19,10 @@ from servobench.plant.contract.files import accessing
 
 DESCRIPTION: Final = "modelDescription.xml"
 MAX_FILES: Final = 20_000  # number of files in an archive
-MAX_UNPACKED: Final = 2_000_000_000  # [bytes] of all files together
-MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which is read into memory
+MAX_UNPACKED: Final = 2_000_000_000  # [bytes] size of all files together
+MAX_DESCRIPTION: Final = (
+    32_000_000  # [bytes] size of the model description, which is read into memory
+)
 MAX_RATIO: Final = (
     100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
 )
@@ -44,14 +46,14 @@ def extract_fmu(path: Path) -> Path:
     """
     with accessing(path, "fmu file", "read"):
         if not path.is_file():
-            raise ValueError(
-                f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}"
-            )
+            found = "is a directory" if path.is_dir() else "does not exist"
+            raise ValueError(f"fmu file {path} {found}")
         key = digest(path)[:32]
     return cached(EXTRACTED, key, lambda folder: _extract(path, folder))
 
 
 def _extract(path: Path, folder: Path) -> None:
+    """Unpack the archive at `path` into a folder, unless it is refused; see `extract_fmu`."""
     with configuration_errors(f"fmu file {path} is not a zip archive: ", *DAMAGES):
         archive = zipfile.ZipFile(path)
     with archive:
@@ -81,6 +83,7 @@ def _place_of(entry: zipfile.ZipInfo) -> str:
 
 
 def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse an archive that climbs out of its folder, holds a file twice, or holds no model description."""
     written = {entry.orig_filename for entry in entries}
     places = {entry.filename for entry in entries}
     for entry in entries:
@@ -108,7 +111,8 @@ def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             f"fmu file {path} has a {DESCRIPTION} of {_megabytes(description)}; at most {_megabytes(MAX_DESCRIPTION)} "
             "are read: export the FMU with fewer variables"
         )
-    unpacked, packed = sum(entry.file_size for entry in entries), path.stat().st_size
+    unpacked = sum(entry.file_size for entry in entries)
+    packed = path.stat().st_size
     if unpacked > MAX_UNPACKED:
         raise ValueError(
             f"fmu file {path} unpacks to {_megabytes(unpacked)}; at most {_megabytes(MAX_UNPACKED)} are unpacked: "

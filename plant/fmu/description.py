@@ -144,10 +144,13 @@ class FmuDescription:
             return self
 
         def resize(variable: Variable) -> Variable:
+            if not variable.dimensions:
+                return variable
             axes = tuple((name, sizes.get(name, size)) for name, size in variable.dimensions)
-            if (size := prod(size for _, size in axes)) > MAX_NUMBERS:
+            size = prod(size for _, size in axes)
+            if size > MAX_NUMBERS:
                 raise _bad_size(variable, self.path, size)
-            return replace(variable, size=size, dimensions=axes) if axes else variable
+            return replace(variable, size=size, dimensions=axes)
 
         return replace(self, variables=tuple(resize(variable) for variable in self.variables))
 
@@ -178,17 +181,19 @@ def read_description(path: Path, root: Path) -> FmuDescription:
             "wanted letters, digits and '_', without folders"
         )
     units = {each.name: each.baseUnit for each in description.unitDefinitions}
+    token = description.guid if version.startswith("2") else description.instantiationToken
+    variables = [_variable(each, path, units) for each in description.modelVariables]
     return FmuDescription(
         path=path,
         root=root,
         version=int(version[0]),
         model_name=str(description.modelName),
         identifier=identifier,
-        token=str(description.guid if version.startswith("2") else description.instantiationToken),
+        token=str(token),
         can_save=bool(interface.canGetAndSetFMUstate),
         can_serialise=bool(interface.canSerializeFMUstate),
         once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
-        variables=tuple(_variable(each, path, units) for each in description.modelVariables),
+        variables=tuple(variables),
         needs_tool=bool(interface.needsExecutionTool),
         exchange=description.coSimulation is None,
         n_states=int(description.numberOfContinuousStates or 0),
@@ -200,6 +205,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
 
 
 def _step(root: Path, tag: str, name: str) -> float | None:
+    """Return a step of the description, s; None for one that is missing or no positive number."""
     step = read_time(root, tag, name, math.nan)
     return step if 0.0 < step < math.inf else None
 
@@ -232,7 +238,8 @@ def read_exchange(path: Path, root: Path) -> None:
         ValueError: broken, not of FMI 2, without model exchange or without directional derivatives.
     """
     description = parse_description(path, root)
-    version, exchange = str(description.fmiVersion), description.modelExchange
+    version = str(description.fmiVersion)
+    exchange = description.modelExchange
     wanted = "wanted FMI 2 with model exchange and directional derivatives"
     hidden = "so its Jacobian cannot be read"
     if not version.startswith("2."):
@@ -255,12 +262,8 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
 
     try:
         version = ET.parse(root / DESCRIPTION).getroot().get("fmiVersion", "none")
-    except (
-        ET.ParseError,
-        LookupError,
-        ValueError,
-        OSError,
-    ) as error:  # LookupError: an unknown encoding
+    except (ET.ParseError, LookupError, ValueError, OSError) as error:
+        # A LookupError is an unknown encoding.
         raise ValueError(f"fmu file {path} has a broken {DESCRIPTION}: {_line(error)}") from error
     if not version.startswith(("2.", "3.")):
         raise ValueError(f"fmu file {path} is of FMI {_line(version)}; wanted FMI 2 or 3")
@@ -280,23 +283,26 @@ def _unit(variable: Any, units: Mapping[str, Any]) -> str:  # noqa: ANN401 - as 
     kind = variable.declaredType
     name = variable.unit or getattr(kind, "unit", None) or ""
     base: Any = units.get(name)
-    relative = getattr(
-        kind if variable.relativeQuantity is None else variable, "relativeQuantity", False
-    )
-    own = None if base is None else SI_UNITS.get(tuple(getattr(base, each) for each in BASES))
+    if base is None:
+        return str(name)
+    exponents = tuple(getattr(base, each) for each in BASES)
+    own = SI_UNITS.get(exponents)
     if own is None:
         return str(name)
-    usual = [
-        each
-        for each, per in UNITS[own].items()
-        if math.isclose(base.factor * per, 1.0, rel_tol=1e-3)
-    ]
-    shift = f"{base.offset:g} + " if base.offset and not relative else ""  # a difference has none
-    return f"{shift}{base.factor:g} × {own}" if shift or not usual else usual[0]
+    described = kind if variable.relativeQuantity is None else variable
+    is_difference = getattr(described, "relativeQuantity", False)
+    if base.offset and not is_difference:
+        return f"{base.offset:g} + {base.factor:g} × {own}"
+    for usual, per in UNITS[own].items():
+        if math.isclose(base.factor * per, 1.0, rel_tol=1e-3):
+            return usual
+    return f"{base.factor:g} × {own}"
 
 
 def _variable(variable: Any, path: Path, units: Mapping[str, Any]) -> Variable:  # noqa: ANN401 - as above
-    name, reference = variable.name, variable.valueReference
+    """Return a variable from fmpy's; a name or a size that cannot be used is a ValueError."""
+    name = variable.name
+    reference = variable.valueReference
     if name is None or not 0 <= reference < 2**32:
         raise ValueError(
             f"fmu file {path} has a variable {_line(repr(name))} with the value reference {_line(reference)}; wanted a "
@@ -306,17 +312,19 @@ def _variable(variable: Any, path: Path, units: Mapping[str, Any]) -> Variable: 
     size = prod(each for _, each in axes)
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
-    kind, settable = variable.causality or "local", variable.variability != "constant"
-    settable = settable and variable.initial != "calculated"
-    return Variable(
-        name, reference, size, kind, variable.type, axes, _unit(variable, units), settable
-    )
+    causality = variable.causality or "local"
+    settable = variable.variability != "constant" and variable.initial != "calculated"
+    unit = _unit(variable, units)
+    return Variable(name, reference, size, causality, variable.type, axes, unit, settable)
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above
     """Return the structural parameter that gives the size of an axis, or no name, and its size."""
-    named = dimension.start is None
-    start = getattr(dimension.variable, "start", None) if named else dimension.start
+    parameter = ""
+    start = dimension.start
+    if start is None:
+        parameter = str(getattr(dimension.variable, "name", ""))
+        start = getattr(dimension.variable, "start", None)
     if start is None:
         raise ValueError(
             f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value"
@@ -327,7 +335,7 @@ def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa
         size = -1
     if not 0 <= size <= MAX_NUMBERS:
         raise _bad_size(variable, path, start)
-    return (str(dimension.variable.name) if named else "", size)
+    return parameter, size
 
 
 def _bad_size(variable: Any, path: Path, came: object) -> ValueError:  # noqa: ANN401 - as above

@@ -74,10 +74,9 @@ class Port:
 class Instance(ABC):
     """One instance of an FMU."""
 
-    prefix: ClassVar[str]  # of the names of all functions in the library
-    real: ClassVar[
-        str
-    ]  # word for real numbers in the names of the functions that read and write them
+    prefix: ClassVar[str]  # begins the names of all functions in the library
+    # Word for real numbers in the names of the functions that read and write them.
+    real: ClassVar[str]
     kinds: ClassVar[Kinds]  # the same word for each numeric type, and how its numbers lie in memory
     state: ClassVar[str]  # word for states in the names of their functions
     deserialise: ClassVar[str]  # the verb of the function that reads a state from bytes
@@ -88,11 +87,9 @@ class Instance(ABC):
         self, description: FmuDescription, tolerance: float | None, debug_log: Path | None
     ) -> None:
         """Make an instance; see `open_instance`."""
-        self.description, self.tolerance, self._debugs = (
-            description,
-            tolerance,
-            debug_log is not None,
-        )
+        self.description = description
+        self.tolerance = tolerance
+        self._debugs = debug_log is not None
         self.log = MessageLog(description.path.name, debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
         self.library = Library(description)
@@ -176,8 +173,11 @@ class Instance(ABC):
         """
         if not status:
             return
-        reached, end, least = self._reached(status, time), time + step, MIN_PROGRESS * step
-        now, rest = ctypes.c_double(), ctypes.c_double()
+        reached = self._reached(status, time)
+        end = time + step
+        least = MIN_PROGRESS * step
+        now = ctypes.c_double()
+        rest = ctypes.c_double()
         call = self.step_call(now, rest)
         while reached is not None:
             if not reached > time + least:
@@ -186,7 +186,8 @@ class Instance(ABC):
                 )
             if reached > end - least:
                 return
-            time = now.value = reached
+            time = reached
+            now.value = reached
             rest.value = end - reached
             reached = self._reached(call(), time)
 
@@ -201,14 +202,18 @@ class Instance(ABC):
 
     def access(self, verb: Literal["Get", "Set"], port: Port, row: int = 0) -> RawCall:
         """Return a function that reads or writes the port's variables by a row of its buffer, for the inner loop."""
+        width = port.values.shape[-1]
         if all(self.kinds[variable.type] == self.kinds[self.real] for variable in port.members):
-            place = self._buffer(port.pointer(row), port.values.shape[-1])
-            return partial(
-                self.function(f"{verb}{self.real}"), self._component, *port.variables, *place
-            )
-        values = port.values.reshape(-1, port.values.shape[-1])[row]
-        parts = np.split(values, np.cumsum([variable.size for variable in port.members])[:-1])
-        calls = [self._converted(verb, *each) for each in zip(port.members, parts, strict=True)]
+            # One call of C for all variables, without a copy.
+            function = self.function(f"{verb}{self.real}")
+            place = self._buffer(port.pointer(row), width)
+            return partial(function, self._component, *port.variables, *place)
+        values = port.values.reshape(-1, width)[row]
+        ends = np.cumsum([variable.size for variable in port.members])
+        parts = np.split(values, ends[:-1])  # views of the buffer
+        calls = []
+        for variable, part in zip(port.members, parts, strict=True):
+            calls.append(self._converted(verb, variable, part))
         return lambda: max(call() for call in calls)
 
     def _converted(
@@ -217,10 +222,9 @@ class Instance(ABC):
         """Return a function that reads or writes one variable of any numeric type by `values`."""
         word, kind = self.kinds[variable.type]
         buffer: npt.NDArray[Any] = np.zeros(variable.size, dtype=kind)
+        function = self.function(f"{verb}{word}")
         place = self._buffer(ctypes.c_void_p(buffer.ctypes.data), variable.size)
-        call = partial(
-            self.function(f"{verb}{word}"), self._component, *Port([variable]).variables, *place
-        )
+        call = partial(function, self._component, *Port([variable]).variables, *place)
 
         def convert() -> int:
             if verb == "Set":
@@ -266,8 +270,9 @@ class Instance(ABC):
         """Return the present state as bytes, or as a handle of this instance for an FMU that cannot serialise."""
         if self.description.can_serialise:
             return self.save_bytes()
-        self._states.append(self._state())
-        return self._states[-1]
+        state = self._state()
+        self._states.append(state)
+        return state
 
     def restore(self, saved: bytes | ctypes.c_void_p) -> None:
         """Return to a state from `save`."""
@@ -300,12 +305,8 @@ class Instance(ABC):
     def restore_bytes(self, content: bytes) -> None:
         """Return to a state from `save_bytes`."""
         state = ctypes.c_void_p()
-        self.call(
-            f"{self.deserialise}{self.state}",
-            content,
-            ctypes.c_size_t(len(content)),
-            ctypes.byref(state),
-        )
+        size = ctypes.c_size_t(len(content))
+        self.call(f"{self.deserialise}{self.state}", content, size, ctypes.byref(state))
         try:
             self.restore(state)
         finally:
@@ -382,15 +383,16 @@ class Integrator:
         Raises:
             FmuError: the FMU refused something, wants to end, or the solver found no way.
         """
-        event_time, end = self._settle(), time + step
+        event_time = self._settle()
+        end = time + step
         self._begin(time)
         while time < end:
-            reached = self._solve(time, min(end, event_time))
-            time = (
-                end if math.isclose(reached[1], end, rel_tol=1e-14, abs_tol=1e-14) else reached[1]
-            )
+            state_event, time = self._solve(time, min(end, event_time))
+            if math.isclose(time, end, rel_tol=1e-14, abs_tol=1e-14):
+                time = end
             self._instance.call("SetTime", ctypes.c_double(time))
-            if (reached[0] or self._asks_for_event() or time >= event_time) and time < end:
+            is_event = state_event or self._asks_for_event() or time >= event_time
+            if is_event and time < end:
                 self._instance.call("EnterEventMode")
                 event_time = self._settle()
                 self._begin(time)
@@ -412,9 +414,12 @@ class Integrator:
         )
 
     def _asks_for_event(self) -> bool:
-        enter, ends = ctypes.c_int(), ctypes.c_int()
+        """Return whether the FMU wants an event after a step of the solver."""
+        enter = ctypes.c_int()
+        ends = ctypes.c_int()
+        no_earlier_state = ctypes.c_int(1)  # The FMU need not keep states before this one.
         self._instance.call(
-            "CompletedIntegratorStep", ctypes.c_int(1), ctypes.byref(enter), ctypes.byref(ends)
+            "CompletedIntegratorStep", no_earlier_state, ctypes.byref(enter), ctypes.byref(ends)
         )
         if ends.value:
             raise FmuError(f"{self._instance.description.path.name} asked to end the simulation")
@@ -453,30 +458,28 @@ class Integrator:
             raise FmuError(
                 f"{name} offers model exchange only, and fmpy has no solver for this machine"
             ) from error
-        description = self._instance.description
+        instance = self._instance
+        # Inputs stay as they are within a step.
+        held_inputs = SimpleNamespace(apply=lambda _time: None)
         return CVodeSolver(
-            nx=description.n_states,
-            nz=description.n_indicators,
+            nx=instance.description.n_states,
+            nz=instance.description.n_indicators,
             get_x=self._vector("GetContinuousStates"),
             set_x=self._vector("SetContinuousStates"),
-            get_dx=self._vector(self._instance.derivatives),
+            get_dx=self._vector(instance.derivatives),
             get_z=self._vector("GetEventIndicators"),
             get_nominals=self._vector("GetNominalsOfContinuousStates"),
-            set_time=self._guarded(
-                lambda now: self._instance.call("SetTime", ctypes.c_double(now))
-            ),
-            input=SimpleNamespace(
-                apply=lambda _time: None
-            ),  # Inputs stay as they are within a step.
+            set_time=self._guarded(lambda now: instance.call("SetTime", ctypes.c_double(now))),
+            input=held_inputs,
             startTime=time,
-            relativeTolerance=self._instance.tolerance or RELATIVE_TOLERANCE,
+            relativeTolerance=instance.tolerance or RELATIVE_TOLERANCE,
             maxNumSteps=MAX_SOLVER_STEPS,
         )
 
     def _vector(self, name: str) -> Callable[..., None]:
-        return self._guarded(
-            lambda values, size: self._instance.call(name, values, ctypes.c_size_t(size))
-        )
+        """Return a callback that reads or writes a vector by a function of the FMU."""
+        call = self._instance.call
+        return self._guarded(lambda values, size: call(name, values, ctypes.c_size_t(size)))
 
     def _guarded(self, act: Callable[..., None]) -> Callable[..., None]:
         """Return a callback for C that stores the first exception in place of raising it."""

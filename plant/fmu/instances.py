@@ -34,7 +34,7 @@ WHOLE_TYPES: Final = {
 class Lane:
     """The instance of a run and the calls of the inner loop, which return a status."""
 
-    instance: Instance  # of the FMU
+    instance: Instance  # the lane's own instance of the FMU
     row: int  # its row in the buffers of all ports
     write: RawCall  # writes the command
     step: RawCall  # takes one step
@@ -96,13 +96,15 @@ class Instances:
     def drop(self, lane: Lane, fault: FmuError) -> None:
         """Stop calling an instance after a fault, and all others if the fault is fatal; that of a single run raises."""
         fatal = lane.instance.library.condemned
-        for each in [each for each in self.live if fatal or each is lane]:
+        stopped = [each for each in self.live if fatal or each is lane]
+        for each in stopped:
             self._fail(self.lanes.index(each), fault)
             self.live.remove(each)
 
     def keep(self, chosen: Sequence[int]) -> None:
         """Close all other instances."""
-        for i in set(range(len(self.lanes))).difference(chosen):
+        others = set(range(len(self.lanes))).difference(chosen)
+        for i in others:
             self.lanes[i].instance.close()
         self.lanes = [self.lanes[i] for i in chosen]
         self.live = [lane for lane in self.lanes if lane in self.live]
@@ -166,21 +168,28 @@ class Instance2(Instance):
         self._callbacks = _callbacks(self.log)
         create = self.function("Instantiate")
         create.restype = ctypes.c_void_p
+        description = self.description
+        interface = MODEL_EXCHANGE if description.exchange else CO_SIMULATION
+        resources = (plain_root(description.root) / "resources").as_uri()
+        invisible = ctypes.c_int(0)
         address: int | None = create(
-            self.description.model_name.encode(),
-            ctypes.c_int(MODEL_EXCHANGE if self.description.exchange else CO_SIMULATION),
-            self.description.token.encode(),
-            (plain_root(self.description.root) / "resources").as_uri().encode(),
+            description.model_name.encode(),
+            ctypes.c_int(interface),
+            description.token.encode(),
+            resources.encode(),
             ctypes.byref(self._callbacks),
-            ctypes.c_int(0),
+            invisible,
             ctypes.c_int(self._debugs),
         )
         return address
 
     def _initialise(self, time: float) -> None:
-        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.tolerance
-        wanted = ctypes.c_int(tolerance is not None), ctypes.c_double(tolerance or 0.0)
-        self.call("SetupExperiment", *wanted, ctypes.c_double(time), no, nothing)
+        tolerance_defined = ctypes.c_int(self.tolerance is not None)
+        tolerance = ctypes.c_double(self.tolerance or 0.0)
+        stop_defined = ctypes.c_int(0)
+        stop = ctypes.c_double(0.0)
+        start = ctypes.c_double(time)
+        self.call("SetupExperiment", tolerance_defined, tolerance, start, stop_defined, stop)
         self.call("EnterInitializationMode")
         self.call("ExitInitializationMode")
 
@@ -193,22 +202,26 @@ class Instance2(Instance):
 
         info = fmi2EventInfo()
         self.call("NewDiscreteStates", ctypes.byref(info))
+        again = bool(info.newDiscreteStatesNeeded)
+        ends = bool(info.terminateSimulation)
         following = info.nextEventTime if info.nextEventTimeDefined else math.inf
-        return bool(info.newDiscreteStatesNeeded), bool(info.terminateSimulation), following
+        return again, ends, following
 
     def _reached(self, status: int, time: float) -> float | None:
         if status != DISCARD:
             self.check(f"at {time:.6g} s, fmi2DoStep", status)
             return None
         reached = ctypes.c_double()
-        query = ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
         lack = "not how far it came"
         try:
-            told = self.function("GetRealStatus")(self._component, *query)
+            read = self.function("GetRealStatus")
+            answer = read(
+                self._component, ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
+            )
         except FmuError as fault:
-            told = DISCARD
+            answer = DISCARD
             lack += f": {fault}"
-        if told != OK:
+        if answer != OK:
             raise self.log.failure(f"at {time:.6g} s, fmi2DoStep", f"discard and {lack}")
         return reached.value
 
@@ -254,11 +267,10 @@ class Instance3(Instance):
 
     def _instantiate(self) -> int | None:
         log = self.log
-        self._end, self._early, self._last_time = (
-            ctypes.c_bool(),
-            ctypes.c_bool(),
-            ctypes.c_double(),
-        )
+        # Results of a step: whether the FMU wants to end, whether it ended early, and when.
+        self._end = ctypes.c_bool()
+        self._early = ctypes.c_bool()
+        self._last_time = ctypes.c_double()
 
         def on_message(
             _environment: int | None, status: int, _category: bytes, message: bytes
@@ -271,42 +283,52 @@ class Instance3(Instance):
             "InstantiateModelExchange" if exchange else "InstantiateCoSimulation"
         )
         create.restype = ctypes.c_void_p
-        no, null = ctypes.c_bool(False), ctypes.c_void_p()
+        no = ctypes.c_bool(False)
+        null = ctypes.c_void_p()
         resources = plain_root(self.description.root) / "resources"
-        names = self.description.model_name, self.description.token, str(resources) + os.sep
-        common = [*(name.encode() for name in names), no, ctypes.c_bool(self._debugs)]
-        early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
-        end = [null, self._on_message]
-        address: int | None = (
-            create(*common, *end) if exchange else create(*common, *early_return, *end, null)
-        )
+        common = [
+            self.description.model_name.encode(),
+            self.description.token.encode(),
+            (str(resources) + os.sep).encode(),
+            no,  # visible
+            ctypes.c_bool(self._debugs),
+        ]
+        messages = [null, self._on_message]
+        # Without event mode and intermediate updates; steps may return early.
+        steps = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]
+        arguments = [*common, *messages] if exchange else [*common, *steps, *messages, null]
+        address: int | None = create(*arguments)
         return address
 
     def _initialise(self, time: float) -> None:
-        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.tolerance
-        wanted = ctypes.c_bool(tolerance is not None), ctypes.c_double(tolerance or 0.0)
-        self.call("EnterInitializationMode", *wanted, ctypes.c_double(time), no, nothing)
+        tolerance_defined = ctypes.c_bool(self.tolerance is not None)
+        tolerance = ctypes.c_double(self.tolerance or 0.0)
+        stop_defined = ctypes.c_bool(False)
+        stop = ctypes.c_double(0.0)
+        start = ctypes.c_double(time)
+        self.call(
+            "EnterInitializationMode", tolerance_defined, tolerance, start, stop_defined, stop
+        )
         self.call("ExitInitializationMode")
 
     def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        end, early = self._end, self._early
-        results = [
-            ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)
-        ]
-        call = partial(
-            self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results
-        )
+        end = self._end
+        early = self._early
+        needs_event = ctypes.c_bool()  # not used without event mode
+        results = [ctypes.byref(each) for each in (needs_event, end, early, self._last_time)]
+        no_earlier_state = ctypes.c_bool(True)  # The FMU need not keep states before this step.
+        function = self.function("DoStep")
+        call = partial(function, self._component, now, step, no_earlier_state, *results)
         return lambda: call() or (WARNING if end.value or early.value else OK)
 
     def update_discrete_states(self) -> tuple[bool, bool, float]:
         """See `Instance.update_discrete_states`."""
         again, ends, nominals, states, has_next = (ctypes.c_bool() for _ in range(5))
         following = ctypes.c_double()
-        results = [
-            ctypes.byref(each) for each in (again, ends, nominals, states, has_next, following)
-        ]
-        self.call("UpdateDiscreteStates", *results)
-        return again.value, ends.value, following.value if has_next.value else math.inf
+        results = (again, ends, nominals, states, has_next, following)
+        self.call("UpdateDiscreteStates", *(ctypes.byref(each) for each in results))
+        event_time = following.value if has_next.value else math.inf
+        return again.value, ends.value, event_time
 
     def _reached(self, status: int, time: float) -> float | None:
         self.check(f"at {time:.6g} s, fmi3DoStep", status)

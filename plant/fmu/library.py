@@ -34,19 +34,19 @@ class Library:
         import fmpy  # noqa: PLC0415 - see parse_description
 
         self.loaded: Any = None  # as after `unload`
-        root, binaries = description.root, description.root / "binaries"
+        root = description.root
+        binaries = root / "binaries"
         wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
         lacking = f"fmu file {description.path} has no library for this machine; wanted"
-        for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
+        # FMI 2 has names of its own for platforms; many of its FMUs bear those of FMI 3.
+        folders = [fmpy.platform_tuple]
+        if description.version == 2:
+            folders.append(fmpy.platform)
+        for folder in folders:
             file = binaries / folder / wanted
             if file.is_file() and file.resolve().is_relative_to(root.resolve()):
                 try:
-                    library = None if description.once_per_process else ctypes.CDLL(str(file))
-                    self.loaded = (
-                        _load_copy(file)
-                        if library is None or library._handle in _fatal
-                        else library
-                    )
+                    self.loaded = _load(file, shared=not description.once_per_process)
                 except OSError as error:
                     remedy = ""
                     if forbids_code(file):
@@ -61,11 +61,9 @@ class Library:
             if file.parent.is_dir():
                 there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
                 raise ValueError(f"{lacking} binaries/{folder}/{wanted}, it has there: {there}")
-        there = (
-            ", ".join(sorted(folder.name for folder in binaries.iterdir()))
-            if binaries.is_dir()
-            else ""
-        )
+        there = ""
+        if binaries.is_dir():
+            there = ", ".join(sorted(folder.name for folder in binaries.iterdir()))
         raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there or 'none'}")
 
     @property
@@ -86,14 +84,28 @@ class Library:
         self.loaded = None
 
 
+def _load(file: Path, *, shared: bool) -> ctypes.CDLL:
+    """Load a library that may be shared by several instances, or a copy of it where it may not, or never again."""
+    if not shared:
+        return _load_copy(file)
+    library = ctypes.CDLL(str(file))
+    if library._handle in _fatal:
+        return _load_copy(file)
+    return library
+
+
 def _load_copy(file: Path) -> ctypes.CDLL:
     """Load a copy of a library and of its folder, so that it shares no variables with another instance."""
-    place = min((Path(tempfile.gettempdir()), cache_folder(EXTRACTED)), key=forbids_code)
+    # The first folder from which code may be loaded; a truth value of False comes first.
+    candidates = (Path(tempfile.gettempdir()), cache_folder(EXTRACTED))
+    place = min(candidates, key=forbids_code)
     place.mkdir(parents=True, exist_ok=True)
+    prefix = f"{UNFINISHED}servobench-"
     with tempfile.TemporaryDirectory(
-        prefix=f"{UNFINISHED}servobench-", dir=place, ignore_cleanup_errors=True
+        prefix=prefix, dir=place, ignore_cleanup_errors=True
     ) as folder:
-        return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
+        copied = shutil.copytree(file.parent, Path(folder) / "library")
+        return ctypes.CDLL(str(copied / file.name))
 
 
 @cache
@@ -103,7 +115,8 @@ def plain_root(root: Path) -> Path:
     It is valid as long as this process lives; where the system has none, it is `root`.
     """
     if root.as_uri() != f"file://{root}":
-        plain = Path(f"/proc/{os.getpid()}/fd/{os.open(root, os.O_RDONLY)}")
+        descriptor = os.open(root, os.O_RDONLY)
+        plain = Path(f"/proc/{os.getpid()}/fd/{descriptor}")
         if plain.is_dir():
             return plain
     return root
@@ -132,7 +145,8 @@ class MessageLog:
         Raises:
             ValueError: the file cannot be written.
         """
-        self._name, self._file = name, file
+        self._name = name
+        self._file = file
         with accessing(file, "debug_log"):
             self._append(f"an instance of {name}")
         self._last: deque[str] = deque(maxlen=REMEMBERED_MESSAGES)
@@ -158,6 +172,8 @@ class MessageLog:
         The messages are forgotten.
         """
         word = STATUS_WORDS.get(outcome, "nothing usable") if isinstance(outcome, int) else outcome
-        said = f"; the FMU said: {' | '.join(self._last)}" if self._last else ""
+        text = f"{self._name}: {function} returned {word}"
+        if self._last:
+            text += f"; the FMU said: {' | '.join(self._last)}"
         self._last.clear()
-        return FmuError(f"{self._name}: {function} returned {word}{said}")
+        return FmuError(text)

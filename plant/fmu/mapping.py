@@ -183,15 +183,18 @@ def read_mapping(kind: type[Roles], path: Path) -> Roles:
     needed = [
         each.name
         for each in fields(cast(Any, kind))
-        if each.default is each.default_factory is MISSING
+        if each.default is MISSING and each.default_factory is MISSING
     ]
     for key in needed:
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
-    empty: Any = kind(**{key: path if key == "file" else ("to be given",) for key in needed})
-    mapping = override(f"mapping {path}", empty, table)
-    log = None if mapping.debug_log is None else path.parent.absolute() / mapping.debug_log
-    made: Roles = replace(mapping, file=path.parent / mapping.file, debug_log=log)
+    # `override` wants an object; what it lacks a default for is in the table.
+    placeholders: dict[str, Any] = dict.fromkeys(needed, ("to be given",))
+    placeholders["file"] = path
+    mapping: Any = override(f"mapping {path}", kind(**placeholders), table)
+    folder = path.parent
+    log = None if mapping.debug_log is None else folder.absolute() / mapping.debug_log
+    made: Roles = replace(mapping, file=folder / mapping.file, debug_log=log)
     return made
 
 
@@ -208,13 +211,15 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
             f"{description.path.name} takes steps of multiples of {own!r} s only (fixedInternalStepSize), so period "
             f"must be one, got {step!r} s"
         )
-    n, m = (
-        total_size(description.select(getattr(mapping, role), role))
-        for role in ("inputs", "features")
-    )
+    n = total_size(description.select(mapping.inputs, "inputs"))
+    m = total_size(description.select(mapping.features, "features"))
     if not (n and m):
         raise ValueError(f"inputs and features must name at least one number each, got {n} and {m}")
-    truth, camera, unit = mapping.truth, mapping.camera or (), mapping.names.feature_unit
+    truth = mapping.truth
+    home = () if mapping.home is None else (mapping.home,)
+    camera = mapping.camera or ()
+    unit = mapping.names.feature_unit
+    # Role, names, number of values, unit.
     roles = (
         ("inputs", mapping.inputs, n, "rad/s"),
         ("joints", mapping.joints, n, "rad"),
@@ -223,41 +228,40 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("truth.features", truth.features, m, unit),
         ("truth.jacobian", truth.jacobian, n * m, f"{unit}/rad"),
         ("truth.states", truth.states, n, "rad"),
-        ("home", () if mapping.home is None else (mapping.home,), n, "rad"),
+        ("home", home, n, "rad"),
         ("camera[1]", camera[:1], 3, "m"),
         ("camera[2]", camera[1:], 3, "rad"),
     )
-    types = {"seen": NUMERIC}
-    found = {
-        role: description.select(names, role, types.get(role, REAL_TYPES))
-        for role, names, *_ in roles
-    }
-    again = ("truth.features", "truth.states")
-    check_roles(
-        {role: part for role, part in found.items() if role not in again}, ("inputs",), description
-    )
+    found = {}
+    for role, names, *_ in roles:
+        types = NUMERIC if role == "seen" else REAL_TYPES
+        found[role] = description.select(names, role, types)
+    # Those of the truth may be variables that have another role as well.
+    repeatable = ("truth.features", "truth.states")
+    unique = {role: part for role, part in found.items() if role not in repeatable}
+    check_roles(unique, ("inputs",), description)
     values = description.select(mapping.parameters, "parameters", None)
     check_roles({"inputs": found["inputs"], "parameters": values}, (), description)
     declared = {variable.unit.translate(SPELLINGS): variable.name for variable in found["features"]}
-    if (known := DECLARED & declared.keys()) and unit.translate(SPELLINGS) not in known:
+    known = DECLARED & declared.keys()
+    if known and unit.translate(SPELLINGS) not in known:
+        first = min(known)
         raise ValueError(
-            f"names.feature_unit must be {min(known)}, the unit of {declared[min(known)]}, got {unit}"
+            f"names.feature_unit must be {first}, the unit of {declared[first]}, got {unit}"
         )
     for role, names, size, own_unit in roles:
-        check_unit(
-            role, found[role], own_unit, any_quantity=role.endswith(("features", "jacobian"))
-        )
-        if names and (came := total_size(found[role])) != size:
+        any_quantity = role.endswith(("features", "jacobian"))
+        check_unit(role, found[role], own_unit, any_quantity=any_quantity)
+        came = total_size(found[role])
+        if names and came != size:
             raise ValueError(
                 f"{role} must name {size} numbers for {n} inputs and {m} features, got {came}"
             )
-    joints, features = (
-        _labels("joint", mapping.names.joints, n),
-        _labels("feature", mapping.names.features, m),
-    )
-    speed, lower, upper = (
-        mapping.limits.of(name, n) for name in ("max_joint_speed", "joint_lower", "joint_upper")
-    )
+    joints = _labels("joint", mapping.names.joints, n)
+    features = _labels("feature", mapping.names.features, m)
+    speed = mapping.limits.of("max_joint_speed", n)
+    lower = mapping.limits.of("joint_lower", n)
+    upper = mapping.limits.of("joint_upper", n)
     return PlantSpec.of_joints(joints, features, speed, lower, upper, period, unit)
 
 
@@ -270,9 +274,8 @@ def check_roles(
         ValueError: names the variable.
     """
     taken: dict[str, str] = {}
-    for role, variable in (
-        (role, variable) for role, variables in roles.items() for variable in variables
-    ):
+    pairs = [(role, variable) for role, variables in roles.items() for variable in variables]
+    for role, variable in pairs:
         if role in inputs and variable.causality != "input":
             raise ValueError(
                 f"{role} names {variable.name!r}, which is of causality {variable.causality}"
@@ -297,10 +300,12 @@ def check_unit(
         ValueError: names the variable and its unit.
     """
     for variable in variables:
-        unit, wanted = variable.unit.translate(SPELLINGS), own.translate(SPELLINGS)
-        same = unit in UNITS.get(wanted, {}) or unit.endswith(f" × {wanted}")  # quantity
-        if (unit in DECLARED or " × " in unit) and unit != wanted and (same or not any_quantity):
-            remedy = "convert it in the FMU" if same else "name another variable"
+        unit = variable.unit.translate(SPELLINGS)
+        wanted = own.translate(SPELLINGS)
+        is_known = unit in DECLARED or " × " in unit
+        same_quantity = unit in UNITS.get(wanted, {}) or unit.endswith(f" × {wanted}")
+        if is_known and unit != wanted and (same_quantity or not any_quantity):
+            remedy = "convert it in the FMU" if same_quantity else "name another variable"
             raise ValueError(
                 f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: {remedy}"
             )
@@ -344,7 +349,7 @@ def count_steps(period: float, written: float) -> int:
     _, digits, exponent = Decimal(repr(written)).as_tuple()
     last = 10.0 ** float(exponent)  # value of a one as the last digit
     is_near = abs(exact - written) <= STEP_TOLERANCE * exact
-    # Also where digits were cut off
+    # A number is near as well where its last digits were rounded or cut off.
     is_rounded = len(digits) >= MIN_DIGITS and -0.5 < (exact - written) / last < 1.0
     if is_near or (is_rounded and count * last < 0.1 * written):
         return count
@@ -378,6 +383,7 @@ def first_instant(given: float | None, description: FmuDescription, step: float)
 
 
 def _labels(kind: str, names: Names | None, count: int) -> Names:
+    """Return the names of joints or features, by default numbered ones."""
     if names is None:
         return tuple(f"{kind}_{i + 1}" for i in range(count))
     if len(names) != count:

@@ -53,9 +53,7 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 REHEARSED_STEPS: Final = 5  # periods of an arm at rest in which outputs of foreign FMUs may jump
 MIN_JUMP: Final = 1e-6  # [unit of the output]
-MAX_JUMP_RATIO: Final = (
-    5.0  # [1] A change is a jump if it is so many times larger than those after it.
-)
+MAX_JUMP_RATIO: Final = 5.0  # [1] A change that exceeds those after it by this factor is a jump.
 # Names in exported arms.
 ARM_JOINTS: Final = ("joint_velocity_command", "joint_position")
 ARM_FEATURES: Final = ("ball_position", "feature")
@@ -65,6 +63,9 @@ INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32", **WHOLE_TYPES}
 EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
 
 Setter = Callable[[Instance, int], None]
+Given = tuple[
+    list[Variable], str, npt.NDArray[Any]
+]  # variables that a name stands for, and their values
 
 
 @settings
@@ -83,8 +84,8 @@ class FmuConfig:
 class FmuState:
     """A saved state of an FMU's world."""
 
-    # of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the world
-    # that saved it
+    # The state of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
+    # world that saved it.
     fmu: tuple[bytes | ctypes.c_void_p, ...]
     period: int  # number of periods since the start
     integrated: FloatArray  # (..., n), rad, joint positions of an FMU that has none itself.
@@ -120,18 +121,23 @@ class FmuWorld(World):
         self._own_step = own_step(mapping.period, period)
         self._substeps = whole_steps(period, self._own_step)
         self._period = period
-        self._mapping, self.lag = mapping, lag
-        self.description = description = read_sized(mapping.file, mapping.parameters)
+        self._mapping = mapping
+        self.lag = lag
+        description = read_sized(mapping.file, mapping.parameters)
+        self.description = description
         if description.needs_tool:
             remark(
                 f"{mapping.file.name} calls the tool that made it, which has to be installed here"
             )
-        if model is None and (unusual := unusual_step(mapping, description, period)):
-            logger.warning(unusual)
+        if model is None:
+            unusual = unusual_step(mapping, description, period)
+            if unusual:
+                logger.warning(unusual)
         self.spec = mapping_spec(mapping, description, period)
         self._begin = first_instant(mapping.start_time, description, self._own_step)
         if model is not None:
-            self.spec, self.noise_unit = replace(self.spec, feature=model.channel), model.noise_unit
+            self.spec = replace(self.spec, feature=model.channel)
+            self.noise_unit = model.noise_unit
         self._is_foreign = model is None
         self._has_start = start is not None
         start = np.zeros(self.spec.n) if start is None else start
@@ -155,10 +161,11 @@ class FmuWorld(World):
         truth = mapping.truth
         self._has_joints = bool(mapping.joints)
         self._command = self._port("inputs", mapping.inputs)
-        self._result = self._port(
-            "joints, features and seen", (*mapping.joints, *mapping.features, *mapping.seen)
-        )
-        self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
+        measured = (*mapping.joints, *mapping.features, *mapping.seen)
+        self._result = self._port("joints, features and seen", measured)
+        true_features = truth.features or mapping.features
+        self._truth = self._port("truth", (*true_features, *truth.jacobian))
+        # Joints come first in a row of results.
         self._split = self.spec.n if mapping.joints else 0
         self._now = ctypes.c_double()
         parameters = dict(mapping.parameters)
@@ -220,7 +227,8 @@ class FmuWorld(World):
         self._command.values[self._rows] = joint_velocity
         instances.check("writing", self._command, [lane.write() for lane in instances.live])
         for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
-            time = self._now.value = self._begin + i * self._own_step
+            time = self._begin + i * self._own_step
+            self._now.value = time
             instances.finish([lane.step() for lane in instances.live], time, self._own_step)
         self._k += 1
         if not self._has_joints:
@@ -230,29 +238,30 @@ class FmuWorld(World):
 
     def _measure(self) -> None:
         """Read joints and feature; those of a lane that failed stay as they were."""
-        self._instances.check(
-            "reading", self._result, [lane.read() for lane in self._instances.live]
-        )
+        status = [lane.read() for lane in self._instances.live]
+        self._instances.check("reading", self._result, status)
         values = np.array(self._result.values[self._rows])
+        first = self._split
+        end = first + self.spec.m
         if self.faults or not is_finite(values):
             for i in np.flatnonzero(~np.isfinite(values).all(axis=-1)).tolist():
                 fault = self._not_finite(values.reshape(-1, values.shape[-1])[i])
                 self._instances.drop(self._instances.lanes[i], fault)
             failed = list(self.faults)
-            values[failed, self._split : self._split + self.spec.m] = self._feature[failed]
+            values[failed, first:end] = self._feature[failed]
             if self._has_joints:
-                values[failed, : self._split] = self._joints[failed]
-        self._joints = values[..., : self._split] if self._has_joints else self._integrated
-        self._feature = values[..., self._split : self._split + self.spec.m]
+                values[failed, :first] = self._joints[failed]
+        self._joints = values[..., :first] if self._has_joints else self._integrated
+        self._feature = values[..., first:end]
         if self._mapping.seen:
-            self._seen = values[..., self._split + self.spec.m :] > SEEN_ABOVE
+            self._seen = values[..., end:] > SEEN_ABOVE
 
     def _not_finite(self, values: FloatArray) -> FmuError:
-        bad = [
-            label
-            for label, value in zip(self._result.labels, values, strict=True)
-            if not np.isfinite(value)
-        ]
+        """Return the fault of a row of results, which names those that are not finite."""
+        bad = []
+        for label, value in zip(self._result.labels, values, strict=True):
+            if not np.isfinite(value):
+                bad.append(label)
         return FmuError(
             f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}"
         )
@@ -303,7 +312,9 @@ class FmuWorld(World):
         if not self._camera:
             super().move_camera(X_BC)
         self._at_start = False
-        poses = X_BC[..., :3, 3], rpy_from_rotation(X_BC[..., :3, :3])
+        position = X_BC[..., :3, 3]
+        angles = rpy_from_rotation(X_BC[..., :3, :3])
+        poses = (position, angles)
         for port, values in zip(self._camera, poses, strict=True):
             port.values[self._rows] = values
 
@@ -315,10 +326,11 @@ class FmuWorld(World):
 
     def truth(self) -> Truth:
         """Return the FMU's own feature and, if the mapping names it or its states, the Jacobian."""
-        self._instances.check(
-            "reading", self._truth, [lane.read_truth() for lane in self._instances.live]
-        )
-        values, m, n = np.array(self._truth.values[self._rows]), self.spec.m, self.spec.n
+        status = [lane.read_truth() for lane in self._instances.live]
+        self._instances.check("reading", self._truth, status)
+        values = np.array(self._truth.values[self._rows])
+        m = self.spec.m
+        n = self.spec.n
         jacobian = None
         if values.shape[-1] > m:
             jacobian = values[..., m:].reshape(*self.lead, m, n)
@@ -338,19 +350,23 @@ class FmuWorld(World):
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """Return the FMU's Jacobian with the mapping's nominal parameters, or None if it has none."""
-        return None if self._nominal is None else self._nominal.jacobian
+        if self._nominal is None:
+            return None
+        return self._nominal.jacobian
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """Close the instances of all other lanes; see `Plant.keep`."""
         chosen = lanes.tolist()
         self._instances.keep(chosen)
         self.faults = {place: self.faults[i] for place, i in enumerate(chosen) if i in self.faults}
-        self.lead, self._rows = (len(chosen),), self._rows[lanes]
-        arrays = self._start, self._joints, self._feature, self._integrated
-        self._start, self._joints, self._feature, self._integrated = (
-            array[lanes] for array in arrays
-        )
-        self._seen = None if self._seen is None else self._seen[lanes]
+        self.lead = (len(chosen),)
+        self._rows = self._rows[lanes]
+        self._start = self._start[lanes]
+        self._joints = self._joints[lanes]
+        self._feature = self._feature[lanes]
+        self._integrated = self._integrated[lanes]
+        if self._seen is not None:
+            self._seen = self._seen[lanes]
 
     def save(self) -> FmuState:
         """Return the present state of the FMU; see `Plant.save`.
@@ -376,7 +392,8 @@ class FmuWorld(World):
         self.faults = {}
         for lane, saved in zip(self._instances.lanes, state.fmu, strict=True):
             lane.instance.restore(saved)
-        self._k, self._integrated = state.period, state.integrated
+        self._k = state.period
+        self._integrated = state.integrated
         self._measure()
 
     def close(self) -> None:
@@ -385,7 +402,8 @@ class FmuWorld(World):
 
     def _free(self) -> None:
         self._instances.close()
-        self._true = self._nominal = None
+        self._true = None
+        self._nominal = None
 
 
 def read_sized(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> FmuDescription:
@@ -394,12 +412,14 @@ def read_sized(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> FmuDescrip
     Raises:
         ValueError: an FMU that cannot be used, a parameter that it does not have, or a value that is no size.
     """
-    description, sizes = read_description(path, extract_fmu(path)), dict[str, int]()
+    description = read_description(path, extract_fmu(path))
+    sizes: dict[str, int] = {}
     for name, value in values.items():
         variables = description.find(name, "parameters", None)
         if variables[0].causality == STRUCTURAL:
             check_value(variables, name, value)
-            sizes |= {variable.name: int(np.ravel(value)[0]) for variable in variables}
+            size = int(np.ravel(value)[0])
+            sizes |= {variable.name: size for variable in variables}
     return description.resized(sizes)
 
 
@@ -409,29 +429,39 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
     Raises:
         ValueError: it does not; names the wanted type.
     """
-    kind, given = variables[0].type, np.asarray(value)
+    kind = variables[0].type
+    given = np.asarray(value)
     if len({variable.type for variable in variables}) > 1:
         raise ValueError(
             f"parameter {name!r} stands for variables of several types; name each by itself"
         )
     came = given.tolist()
     if kind == "String":
-        fits, wanted = given.dtype.kind == "U", "text"
+        fits = given.dtype.kind == "U"
+        wanted = "text"
     elif kind == "Boolean":
-        fits, wanted = given.dtype.kind == "b", "true or false"
+        fits = given.dtype.kind == "b"
+        wanted = "true or false"
     elif kind in INTEGERS:
         bounds = np.iinfo(INTEGERS[kind])
-        low, high = max(int(bounds.min), -EXACT), min(int(bounds.max), EXACT)
-        fits = given.dtype.kind == "f" and bool(
-            ((given == np.round(given)) & (given >= low) & (given <= high)).all()
-        )
+        low = max(int(bounds.min), -EXACT)
+        high = min(int(bounds.max), EXACT)
+        fits = given.dtype.kind == "f" and _whole_within(given, low, high)
         wanted = f"a whole number from {low} to {high}"
     elif kind in REAL_TYPES:
-        fits, wanted = given.dtype.kind == "f", "a number"
+        fits = given.dtype.kind == "f"
+        wanted = "a number"
     else:
         raise ValueError(f"parameter {name!r} is of type {kind}, which a mapping cannot set")
     if not fits:
         raise ValueError(f"parameter {name!r} is of type {kind}: wanted {wanted}, got {came!r}")
+
+
+def _whole_within(values: FloatArray, low: int, high: int) -> bool:
+    """Return whether all numbers are whole and within bounds, both included."""
+    whole = values == np.round(values)
+    within = (values >= low) & (values <= high)
+    return bool((whole & within).all())
 
 
 def setters(
@@ -449,19 +479,21 @@ def setters(
     Raises:
         ValueError: a value of the wrong type or size.
     """
-    found = [
-        (description.find(name, "parameters", None), name, value)
-        for name, value in parameters.items()
-    ]
-    sizes_first = sorted(found, key=lambda each: each[0][0].causality != STRUCTURAL)
-    return [_setter(*each, lead) for each in sizes_first]
+    sizes: list[Given] = []
+    others: list[Given] = []
+    for name, value in parameters.items():
+        variables = description.find(name, "parameters", None)
+        group = sizes if variables[0].causality == STRUCTURAL else others
+        group.append((variables, name, value))
+    return [_setter(variables, name, value, lead) for variables, name, value in sizes + others]
 
 
 def _setter(
     variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]
 ) -> Setter:
     check_value(variables, name, value)
-    size, given = total_size(variables), np.asarray(value)
+    size = total_size(variables)
+    given = np.asarray(value)
     if given.shape not in ((), (size,), (*lead, size)):
         raise ValueError(f"parameter {name!r} must have {size} values, got {given.size}")
     if variables[0].type == "String":
@@ -496,13 +528,12 @@ def build_fmu(
         ValueError: an FMU or mapping that cannot be used; also if the FMU itself says so.
     """
     start = mapping.start if setup.start is None else setup.start
+
+    def make(own: PlantSetup) -> FmuWorld:
+        return FmuWorld(mapping, start, own.period, lag, model)
+
     with configuration_errors("", FmuError):
-        return build_bench(
-            lambda own: FmuWorld(mapping, start, own.period, lag, model),
-            setup,
-            command_delay,
-            sensing,
-        )
+        return build_bench(make, setup, command_delay, sensing)
 
 
 def fmu_entry(path: Path) -> PlantEntry:

@@ -45,8 +45,8 @@ MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
 RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
-# [px] of a window around the target: four in which colour noise can matter, and two for the shift of an edge by
-# rounding and by the sampling point of a pixel.
+# [px] Margin of a window around the target: four in which colour noise can matter, and two for the shift of an edge
+# by rounding and by the sampling point of a pixel.
 MARGIN = 6
 
 

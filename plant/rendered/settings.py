@@ -23,7 +23,7 @@ from servobench.plant.contract.settings import (
 from servobench.plant.robot import ur5
 from servobench.plant.robot.robot import Robot
 
-RATED_PAYLOAD = 5.0  # [kg] of a UR5
+RATED_PAYLOAD = 5.0  # [kg] a UR5's, by its maker
 BoxNumbers = Annotated[tuple[Annotated[Number, Usual(20.0)], ...], Len(6, 6)]
 Load = Annotated[NonNegative, Usual(100.0)]
 
