@@ -100,10 +100,14 @@ def follow_with_overshoot(
         period: [s].
     """
     q, v, a = joints
-    omega, decrement = 1.0 / config.lag, -math.log(config.overshoot)
+    omega = 1.0 / config.lag
+    decrement = -math.log(config.overshoot)
     sigma = omega * decrement / math.hypot(math.pi, decrement)  # ζω
     damped = math.sqrt(omega**2 - sigma**2)
-    cosine, sine = (math.exp(-sigma * period) * f(damped * period) for f in (math.cos, math.sin))
+    decay = math.exp(-sigma * period)
+    cosine = decay * math.cos(damped * period)
+    sine = decay * math.sin(damped * period)
+    # w = v − u swings to 0; its end and slope give the way by integrating v̈ = −ω² w − 2σ v̇.
     w = v - u
     later = (cosine + sigma / damped * sine) * w + sine / damped * a
     slope = (cosine - sigma / damped * sine) * a - omega**2 / damped * sine * w

@@ -217,7 +217,11 @@ class Bench(Plant):
         self._upper = spec.command.upper
         self._k = -1
         self._size_masks()
-        self._camera = self._first_camera = camera if sensing.camera_turn > 0.0 else None
+        # Poses of a camera that turns: at the start, and there after a command moved it; None for others.
+        self._first_camera: FloatArray | None = None
+        if sensing.camera_turn > 0.0:
+            self._first_camera = camera
+        self._camera = self._first_camera
         if sensing.camera_turn > 0.0:
             if camera is None:
                 raise ValueError(
@@ -467,7 +471,8 @@ class Bench(Plant):
         if X_BC.shape not in (shape, (4, 4)):
             raise ValueError(f"X_BC must have shape {shape}, got {X_BC.shape}")
         pose = np.broadcast_to(X_BC, shape)
-        self._camera = None if self._camera is None else pose
+        if self._camera is not None:
+            self._camera = pose
         self.world.move_camera(pose)
 
     def close(self) -> None:

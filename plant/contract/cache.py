@@ -92,7 +92,8 @@ def _folders(kind: str) -> list[Path]:
     Raises:
         ValueError: other users can write all of them.
     """
-    user, temporary = _user_cache(), _temporary_cache()
+    user = _user_cache()
+    temporary = _temporary_cache()
     folders = []
     for root, may_be_shared in ((user, kind not in CODE), (temporary, False)):
         if root is not None and (may_be_shared or _is_private(root / kind)):
@@ -221,16 +222,17 @@ def _remove(entry: Path) -> None:
 
 def _prune(kind: Path) -> None:
     """Remove entries that were not used for long, and unfinished ones of processes that were killed."""
-    now, ages = time.time(), dict[Path, float]()
+    now = time.time()
+    ages: dict[Path, float] = {}
     for path in kind.iterdir():
         with contextlib.suppress(OSError):
             ages[path] = now - path.stat().st_mtime
     entries = sorted((path for path in ages if path.is_dir()), key=lambda path: ages[path])
     for place, entry in enumerate(entries):
+        age = ages[entry]
         unfinished = entry.name.startswith(UNFINISHED)
-        if ages[entry] > MAX_AGE or (
-            ages[entry] > MIN_AGE and (unfinished or place >= MAX_ENTRIES)
-        ):
+        superfluous = age > MIN_AGE and (unfinished or place >= MAX_ENTRIES)
+        if age > MAX_AGE or superfluous:
             with contextlib.suppress(OSError):  # It may be another user's.
                 _remove(entry)
 
@@ -247,7 +249,7 @@ def _alone(kind: Path) -> Iterator[None]:
 
 
 def _wait_for_lock(descriptor: int) -> None:
-    """Take a lock, for which a process waits a while: another user could hold it for ever."""
+    """Take a lock, for which a process waits a while: another user could hold it without end."""
     deadline = time.monotonic() + LOCK_TIME
     while time.monotonic() < deadline:
         with contextlib.suppress(BlockingIOError):

@@ -74,9 +74,10 @@ def whole_steps(period: float, own_step: float) -> int:
     """
     count = round(period / own_step) if period > 0.0 else 0
     if count < 1 or abs(count * own_step - period) > 1e-9:
+        nearest = max(count, 1) * own_step
         raise ValueError(
             f"period must be a whole multiple of the plant's own step of {own_step:.9g} s, got {period:.9g} s; "
-            f"the nearest is {max(count, 1) * own_step:.9g} s"
+            f"the nearest is {nearest:.9g} s"
         )
     return count
 

@@ -53,7 +53,8 @@ def append_sums(folder: Path, digests: Mapping[str, str]) -> None:
         size = file.seek(0, os.SEEK_END)
         if size:
             file.seek(size - 1)
-            lines = lines if file.read(1) == b"\n" else b"\n" + lines
+            if file.read(1) != b"\n":
+                lines = b"\n" + lines
         file.write(lines)
         file.flush()
         os.fsync(file.fileno())
@@ -101,7 +102,7 @@ def fault(folder: Path, name: str, sums: Sums | None) -> str | None:
     path = folder / name
     try:
         size = path.stat().st_size
-        if not (path.is_file() or path.is_dir()):  # a pipe would be read for ever
+        if not (path.is_file() or path.is_dir()):  # A pipe would be read without end.
             return "is no file"
         if sums is not None and name in sums and digest(path) in sums[name]:
             return None

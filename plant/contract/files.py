@@ -118,17 +118,15 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
         yield
     except OSError as error:
         file = Path(str(error.filename or path))
-        if (
-            path is not None
-            and done == "written"
-            and path not in (file, *file.parents)
-            and file not in path.parents
-        ):
+        elsewhere = (
+            path is not None and path not in (file, *file.parents) and file not in path.parents
+        )
+        if done == "written" and elsewhere:
             raise ConfigurationError(
                 f"{file}, which {path} needs, cannot be read: {reason(error)}"
             ) from error
         if done == "written" and (error.errno is None or not (path or error.filename)):
-            raise  # of a library that draws, or of no file in particular
+            raise  # It is an error of a library that draws, or of no file in particular.
         named = f"{kind} {path}" if kind else error.filename or path
         raise ConfigurationError(f"{named} cannot be {done}: {reason(error)}") from error
 
@@ -237,14 +235,11 @@ def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as 
             f"{kind} {path} has {marks[0]!r} between its columns; write commas, and numbers as 0.5"
         )
     with configuration_errors(f"{kind} {path} is no table: ", OSError):
-        table = (
-            pd.read_parquet(path)
-            if text is None
-            else pd.read_csv(io.StringIO(text), skipinitialspace=True)
-        )
-    if (
-        text is not None and type(table.index) is not pd.RangeIndex
-    ):  # the first cells were taken for names of rows
+        is_csv = text is not None
+        source = io.StringIO(text)
+        table = pd.read_csv(source, skipinitialspace=True) if is_csv else pd.read_parquet(path)
+    # With more cells in rows than in the header, the first cells are taken for names of rows.
+    if is_csv and type(table.index) is not pd.RangeIndex:
         raise ConfigurationError(
             f"{kind} {path} has rows of more cells than its header; write numbers as 0.5"
         )
@@ -276,7 +271,9 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     import numpy as np  # noqa: PLC0415 - as above
     import pandas as pd  # noqa: PLC0415 - as above
 
-    lacking = [f"column {name}" for name in names if name not in table] or ["rows"] * table.empty
+    lacking = [f"column {name}" for name in names if name not in table]
+    if not lacking and table.empty:
+        lacking.append("rows")
     if lacking:
         raise ConfigurationError(f"{what} has no {lacking[0]}; it needs {', '.join(names)}")
     chosen = table[list(names)]
@@ -286,8 +283,10 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
         if isinstance(kind, pd.CategoricalDtype):
             chosen = chosen.astype({name: object})
     with configuration_errors(f"{what} has a number without end: ", OverflowError):
-        told = chosen.replace({"True": 1, "False": 0})  # texts if another cell is no truth
-        values = told.apply(pd.to_numeric, errors="coerce").to_numpy(np.float64, na_value=np.nan)
+        # Truth values are texts if another cell of the column is none.
+        replaced = chosen.replace({"True": 1, "False": 0})
+        numeric = replaced.apply(pd.to_numeric, errors="coerce")
+        values = numeric.to_numpy(np.float64, na_value=np.nan)
     within = np.abs(values) < MAX_NUMBER
     if not within.all():
         row, column = np.argwhere(~within)[0].tolist()
@@ -307,7 +306,9 @@ def harmless(text: str) -> str:
 
 def reason(error: Exception) -> str:
     """Return the reason of an error about a file; for an error of the system without its number and path."""
-    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error)
 
 
 def user_path(text: str) -> Path:

@@ -80,10 +80,12 @@ class Stream:
         self._seeds = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
         for seed in self._seeds:
             check_seed(seed)
-        self._generators: list[
-            np.random.Generator
-        ] = []  # Made with the first block, as many streams are never used.
-        self._name, self._draw, self._shape, self._factor = name, draw, (BLOCK, *shape), factor
+        # Generators are made with the first block, as many streams are never used.
+        self._generators: list[np.random.Generator] = []
+        self._name = name
+        self._draw = draw
+        self._shape = (BLOCK, *shape)
+        self._factor = factor
         self._block: FloatArray = np.empty(0)
         self._used = BLOCK
 
@@ -104,7 +106,5 @@ class Stream:
         """Drop the streams of all other lanes."""
         self._seeds = [self._seeds[lane] for lane in lanes]
         if self._generators:
-            self._generators, self._block = (
-                [self._generators[lane] for lane in lanes],
-                self._block[:, lanes],
-            )
+            self._generators = [self._generators[lane] for lane in lanes]
+            self._block = self._block[:, lanes]
