@@ -195,11 +195,9 @@ def _compiler(target: Platform) -> list[str]:
             )
     if importlib.util.find_spec("ziglang") is not None:
         return [sys.executable, "-m", "ziglang", "cc", "-target", target.zig_target]
-    wanted = (
-        "no C compiler was found"
-        if target == this_platform()
-        else "only zig compiles for another machine"
-    )
+    wanted = "only zig compiles for another machine"
+    if target == this_platform():
+        wanted = "no C compiler was found"
     raise CompilerMissing(
         f"{target.name}: {wanted}; install gcc or clang (for this machine), or zig with pip install 'servobench[cross]'"
     )

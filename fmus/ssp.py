@@ -15,7 +15,8 @@ from servobench.fmus.variables import BALL, INPUT
 SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC: Final = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 STRUCTURE: Final = "SystemStructure.ssd"
-PLANT, CONTROLLER = "plant", "controller"
+PLANT = "plant"
+CONTROLLER = "controller"
 
 
 def write_loop(

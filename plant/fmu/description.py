@@ -44,14 +44,14 @@ class Variable:
     type: str = "Real"  # such as Real, Float32, Int64, Boolean or String
     # sizes of its axes: numbers, or names of structural parameters with their start values
     dimensions: tuple[tuple[str, int], ...] = ()
-    unit: str = ""  # empty where none is told; see `_unit`
+    unit: str = ""  # empty where the FMU names none; see `_unit`
     settable: bool = True  # whether the FMU takes a value for it before a run
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""
-        return (
-            [self.name] if self.size == 1 else [f"{self.name}[{i + 1}]" for i in range(self.size)]
-        )
+        if self.size == 1:
+            return [self.name]
+        return [f"{self.name}[{i + 1}]" for i in range(self.size)]
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,15 @@ class FmuDescription:
         for variable in self.variables:
             match = re.fullmatch(r"(.+)\[([0-9, ]+)\](\)?)", variable.name)
             if match is not None:
+                # "der(q[2])" is a member of the family "der(q)".
+                family = match[1] + match[3]
                 index = tuple(int(part) for part in match[2].split(","))
-                families.setdefault(match[1] + match[3], []).append((index, variable))
-        return {
-            name: [member for _, member in sorted(pairs, key=itemgetter(0))]
-            for name, pairs in families.items()
-        }
+                families.setdefault(family, []).append((index, variable))
+        members = {}
+        for name, pairs in families.items():
+            in_order = sorted(pairs, key=itemgetter(0))
+            members[name] = [variable for _, variable in in_order]
+        return members
 
     def find(
         self, name: str, role: str, types: Container[str] | None = REAL_TYPES
@@ -110,10 +113,8 @@ class FmuDescription:
         """
         found = [self._by_name[name]] if name in self._by_name else self._families.get(name)
         if found is None:
-            known = [
-                *self._families,
-                *(each.name for each in self.variables if "[" not in each.name),
-            ]
+            scalars = [each.name for each in self.variables if "[" not in each.name]
+            known = [*self._families, *scalars]
             raise ValueError(
                 f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}"
             )

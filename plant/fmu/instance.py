@@ -31,7 +31,11 @@ Call: TypeAlias = Callable[[], None]
 # Type of a variable -> word in the names of functions, type in memory
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]
 RawCall: TypeAlias = Callable[[], int]  # The caller has to check the returned status.
-OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
+# Statuses of FMI.
+OK: Final = 0
+WARNING: Final = 1
+DISCARD: Final = 2
+FATAL: Final = 4
 MIN_PROGRESS = 1e-9  # least share of a step for a partial step
 RELATIVE_TOLERANCE: Final = 1e-8
 MAX_SOLVER_STEPS: Final = 100_000  # steps of CVode in one step of the plant
@@ -64,7 +68,11 @@ class Port:
     @property
     def summary(self) -> str:
         """A few names, for messages."""
-        return ", ".join(self.labels[:3]) + (", …" if len(self.labels) > 3 else "")
+        labels = self.labels
+        first = ", ".join(labels[:3])
+        if len(labels) <= 3:
+            return first
+        return f"{first}, …"
 
     def pointer(self, row: int = 0) -> ctypes.c_void_p:
         """Return a row of the buffer, for C."""

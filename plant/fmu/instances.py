@@ -22,8 +22,10 @@ from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Kinds, Port, RawCall
 from servobench.plant.fmu.library import MessageLog, plain_root
 
-MODEL_EXCHANGE, CO_SIMULATION = 0, 1
-LAST_SUCCESSFUL_TIME = 2
+# Codes of FMI 2: types of an FMU, and a status that can be asked for.
+MODEL_EXCHANGE: Final = 0
+CO_SIMULATION: Final = 1
+LAST_SUCCESSFUL_TIME: Final = 2
 # Whole numbers of FMI 3 -> their type in memory.
 WHOLE_TYPES: Final = {
     f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)
@@ -155,7 +157,11 @@ _on_message = _Logger(_log_message)
 class Instance2(Instance):
     """One instance of an FMI 2.0 FMU."""
 
-    prefix, real, state, deserialise, early = "fmi2", "Real", "FMUstate", "DeSerialize", "discard"
+    prefix = "fmi2"
+    real = "Real"
+    state = "FMUstate"
+    deserialise = "DeSerialize"
+    early = "discard"
     derivatives = "GetDerivatives"
     kinds: ClassVar[Kinds] = {
         "Real": ("Real", np.float64),
@@ -255,7 +261,11 @@ LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char
 class Instance3(Instance):
     """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
 
-    prefix, real, state, deserialise, early = "fmi3", "Float64", "FMUState", "Deserialize", "early"
+    prefix = "fmi3"
+    real = "Float64"
+    state = "FMUState"
+    deserialise = "Deserialize"
+    early = "early"
     derivatives = "GetContinuousStateDerivatives"
     kinds: ClassVar[Kinds] = {
         "Float64": ("Float64", np.float64),

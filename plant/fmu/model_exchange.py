@@ -90,9 +90,8 @@ def build_model(
         )
     values: dict[str, float] = {}
     for name, value in {**mapping.parameters, **(parameters or {})}.items():
-        variables = description.find(
-            name, "nominal" if parameters and name in parameters else "parameters", None
-        )
+        role = "nominal" if parameters and name in parameters else "parameters"
+        variables = description.find(name, role, None)
         if variables[0].type == "String":
             raise ValueError(
                 f"parameter {name!r} is a text, which CasADi cannot give to the FMU's model"
@@ -102,14 +101,13 @@ def build_model(
                 f"parameter {name!r} must have {len(variables)} values, got {np.size(value)}"
             )
         scalars = np.broadcast_to(value, (len(variables),)).tolist()
-        values |= {
-            variable.name: scalar for variable, scalar in zip(variables, scalars, strict=True)
-        }
+        for variable, scalar in zip(variables, scalars, strict=True):
+            values[variable.name] = scalar
     joints = description.select(states, "truth.states" if mapping.truth.states else "joints")
     features = description.select(mapping.truth.features or mapping.features, "features")
-    return FmuModel(
-        mapping.file, [each.name for each in joints], [each.name for each in features], values
-    )
+    joint_names = [each.name for each in joints]
+    feature_names = [each.name for each in features]
+    return FmuModel(mapping.file, joint_names, feature_names, values)
 
 
 def _feature_function(
@@ -122,15 +120,17 @@ def _feature_function(
     """Return q -> y with everything else at its start."""
     try:
         builder = casadi.DaeBuilder("fmu", str(root))
-        states, constants, fixed = list(builder.x()), list(builder.p()), list(builder.c())
-        _check_names(
-            "parameters or nominal", parameters, [*constants, *fixed], f"parameters of {path.name}"
-        )
+        states = list(builder.x())
+        constants = list(builder.p())
+        fixed = list(builder.c())
+        settable = [*constants, *fixed]
+        _check_names("parameters or nominal", parameters, settable, f"parameters of {path.name}")
         _check_names("joints", joints, states, f"states of {path.name}")
         _check_names("features", features, list(builder.y()), f"outputs of {path.name}")
         for name in set(fixed).intersection(parameters):
             builder.set(name, parameters[name])
-        values = {**dict(zip(constants, _starts(builder, constants), strict=True)), **parameters}
+        values = dict(zip(constants, _starts(builder, constants), strict=True))
+        values.update(parameters)
         builder.set_y(list(features))
         whole = builder.create("fmu", ["x", "u", "p"], ["y"])
     except RuntimeError as error:
@@ -142,7 +142,8 @@ def _feature_function(
     rest = dict(zip(states, _starts(builder, states), strict=True))
     x = casadi.vertcat(*(q[place[name]] if name in place else rest[name] for name in states))
     inputs = casadi.DM(_starts(builder, list(builder.u())))
-    feature = whole(x, inputs, casadi.DM([float(values[name]) for name in constants]))
+    constant_values = casadi.DM([float(values[name]) for name in constants])
+    feature = whole(x, inputs, constant_values)
     return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 
