@@ -418,7 +418,7 @@ def reduced(
     return Traced.of(result, shape, kind)
 
 
-def _axes_of(axis: Any, ndim: int) -> tuple[int, ...]:  # noqa: ANN401 - as numpy's
+def _axes_of(axis: int | Sequence[int] | None, ndim: int) -> tuple[int, ...]:
     """Return the numbers of axes, counted from the first one, for one axis, several, or None for all."""
     if axis is None:
         return tuple(range(ndim))
