@@ -41,37 +41,57 @@ MAX_LATENCY: Final = 0.25  # [s]
 LATENCY_STEP: Final = 0.0125  # [s] of the first search
 MIN_FRAMES: Final = 50
 MAX_FRAMES: Final = 6000
-PRIORS: Final = {  # standard deviations by the begin of a parameter's name
-    "latency": 0.1, "camera_turn": 1.0, "camera": 1.0, "tool": 0.05, "focal": 0.1, "centre": 20.0, "distortion": 0.2,
-    "gear": 0.1, "zero": 0.2, "link": 0.1, "backlash": 0.02, "ripple": 0.05, "compliance": 0.01, "turning": 0.2,
-    "swing": 0.1, "drift": 0.01,
-}  # fmt: skip
+# Prior standard deviation of each kind of parameter, which is the beginning of its name.
+PRIORS: Final = {
+    "latency": 0.1,  # [s]
+    "camera_turn": 1.0,  # [rad]
+    "camera": 1.0,  # [m]
+    "tool": 0.05,  # [m]
+    "focal": 0.1,  # [1]
+    "centre": 20.0,  # [px]
+    "distortion": 0.2,  # [1]
+    "gear": 0.1,  # [1]
+    "zero": 0.2,  # [rad]
+    "link": 0.1,  # [1]
+    "backlash": 0.02,  # [rad]
+    "ripple": 0.05,  # [rad]
+    "compliance": 0.01,  # [s²]
+    "turning": 0.2,  # [rad/s]
+    "swing": 0.1,  # [s]
+    "drift": 0.01,  # [s/s]
+}
 EXTRAS: Final = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compliance", "turning")
 """Parameters of gears, clocks, tool and mounting; pixels do not tell the last two."""
-EXPOSURE: Final = ("latency", *EXTRAS[:5])  # which joints a frame shows
+TOLD_BY_PIXELS: Final = EXTRAS[:5]
+EXPOSURE: Final = ("latency", *TOLD_BY_PIXELS)  # parameters that decide which joints a frame shows
 ARM: Final = ("gear", "zero", "link", "tool")
 """How the names of the arm's own parameters begin."""
-MAX_OFF_TURN: Final = 1.0  # [rad] by which the jump of a wrapped joint is no turn
-JUMP_SPEED: Final = 1.5  # [1] of the speed limit of a joint, and
-JUMP_STEP: Final = 0.05  # [rad] in addition, beyond which a motion from row to row is a jump
-CHANGE: Final = (
-    2.5  # [1] of the least change of a feature, such as one pixel, beyond which a change is large
-)
+MAX_OFF_TURN: Final = 1.0  # [rad] A joint is wrapped if it jumps by 2π to within this.
+# A motion from row to row is a jump if it is faster than this many speed limits, and JUMP_STEP more.
+JUMP_SPEED: Final = 1.5  # [1]
+JUMP_STEP: Final = 0.05  # [rad]
+# A change of a feature is large if it exceeds its least change, such as one pixel, by this factor.
+LARGE_CHANGE_RATIO: Final = 2.5  # [1]
 MAX_REPEATED: Final = 0.01  # [1] share of frames that equal another one although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
-UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
-TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] of the first search
-SWINGS: Final = np.geomspace(1.0, 20.0, 120)  # [s] periods of the search
-SWINGS_IN_LOG: Final = 3  # at least
+UNLIKELY: Final = 3.0  # [1] A parameter of the arm is unlikely beyond this many prior deviations.
+TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] tried in the first search
+SWING_PERIODS: Final = np.geomspace(1.0, 20.0, 120)  # [s] tried in the search
+MIN_SWINGS: Final = 3  # A log must be longer than this many periods of a swing.
 RIPPLE_ORDER: Final = MechanicsConfig().ripple_order
-MIN_PLAY: Final = 0.002  # [rad] about which the effect of play is linear
-TOLD: Final = 1.2  # [1] growth of a deviation with a prior of twice the width, below which the log tells a parameter
-TOLD_SHARE: Final = 0.5  # [1] of its prior deviation, below which a direction is drawn from
+MIN_PLAY: Final = 0.002  # [rad] play about which its effect is linearised
+# The log tells a parameter if its deviation grows less than this with a prior of twice the width.
+MAX_PRIOR_EFFECT: Final = 1.2  # [1]
+# The log tells a direction of θ if its posterior deviation is below this share of the prior one.
+MAX_PRIOR_SHARE: Final = 0.5  # [1]
 OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
 FITS: Final = 4
-ROWS_AT_ONCE: Final = 2**14  # of logs that are placed before a camera side by side
-STEP: Final = 1e-6  # [1] of differences, in prior deviations
-MAX_LAGS: Final = 100  # [frames] of the correlation time
+RELATIVE_TOLERANCES: Final = (1e-4, 1e-6)  # [1] of the cost, in robust fits and in the last one
+MAX_EVALUATIONS: Final = 5  # of the residuals, for each fit and parameter
+WEISZFELD_STEPS: Final = 5
+ROWS_AT_ONCE: Final = 2**14  # rows of logs for which cameras are placed side by side
+STEP: Final = 1e-6  # [1] step of finite differences, in prior deviations
+MAX_LAGS: Final = 100  # [frames] longest lag in the correlation time
 
 
 class Log(NamedTuple):
@@ -81,17 +101,18 @@ class Log(NamedTuple):
     time: FloatArray  # (k,) [s]
     joints: FloatArray  # (k, n) [rad]
     features: FloatArray  # (k, m) [unit of the feature]
-    valid: BoolArray  # (k,) of rows with a new frame
+    valid: BoolArray  # (k,) whether a row has a new frame
     commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
 
     def farthest_joint(self) -> tuple[float, str]:
         """Return how far a joint is beyond its range at most [rad], and where that is."""
-        q, lower, upper = self.joints, self.spec.joint_lower, self.spec.joint_upper
+        q = self.joints
+        lower = self.spec.joint_lower
+        upper = self.spec.joint_upper
         beyond = np.maximum(q - upper, lower - q)
         row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
-        place = (
-            f"row {row} of the log has {self.spec.joint_names[joint]} at {q[row, joint]:.4g} rad"
-        )
+        name = self.spec.joint_names[joint]
+        place = f"row {row} of the log has {name} at {q[row, joint]:.4g} rad"
         limits = f"{lower[joint]:.4g} to {upper[joint]:.4g} rad"
         return float(beyond[row, joint]), f"{place}, beyond its range of {limits}"
 
@@ -105,52 +126,61 @@ class Log(NamedTuple):
 
     def first_jump(self) -> tuple[str, bool]:
         """Return where a joint moves far beyond its speed, by a turn if one does, with the remedy; and if by a turn."""
-        jumps, limits = (
-            np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1])),
-            self.spec.joint_velocity_limit,
-        )
-        beyond = np.argwhere(jumps > JUMP_SPEED * limits * self.spec.period + JUMP_STEP).tolist()
+        jumps = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1]))
+        limits = self.spec.joint_velocity_limit
+        farthest = JUMP_SPEED * limits * self.spec.period + JUMP_STEP
+        beyond = np.argwhere(jumps > farthest).tolist()
         if not beyond:
             return "", False
         turns = np.abs(jumps - 2.0 * np.pi) <= MAX_OFF_TURN
-        row, joint = max(beyond, key=lambda at: turns[*at])  # the first of them
-        where = f"joint {self.spec.joint_names[joint]} jumps by {jumps[row, joint]:.4g} rad in row {row}"
+        # The maximum of truth values is the first turn, or the first jump where none is a turn.
+        row, joint = max(beyond, key=lambda place: turns[*place])
+        name = self.spec.joint_names[joint]
+        where = f"joint {name} jumps by {jumps[row, joint]:.4g} rad in row {row}"
         if turns[row, joint]:
             return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)", True
-        return (
-            f"{where}, above {limits[joint]:.3g} rad/s: interpolate lost or held positions, or cut there",
-            False,
-        )
+        remedy = "interpolate lost or held positions, or cut there"
+        return f"{where}, above {limits[joint]:.3g} rad/s: {remedy}", False
 
     def frame_mistake(self) -> str:
         """Name frames given as new that equal the one before, or are all the same, although the arm moves."""
         rows = frames_of(self)
-        _, kinds, counts = np.unique(
-            self.features[rows], axis=0, return_inverse=True, return_counts=True
-        )
-        steps = np.diff(self.features[rows], axis=0)
-        moves = steps[changed := steps.any(axis=1)]
-        large = (
-            np.abs(moves) > CHANGE * np.abs(moves).min(axis=0, initial=np.inf, where=moves != 0.0)
-        ).any(axis=1)
-        # Large changes before or after equal frames
-        jumps = np.append(False, large) | np.append(large, True)
-        back = np.linalg.norm(moves[:-1] + moves[1:], axis=1) < 0.5 * np.linalg.norm(
-            moves[1:], axis=1
-        )
-        # As 0 stands for no frame, but not in laps
-        often = (counts > max(2, MAX_REPEATED * len(rows)))[kinds[1:]]
-        since = np.cumsum(changed)  # changes so far, which equal frames share
-        same = (~changed | (often & np.pad(back, 1)[since])) & jumps[since]
-        moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
-        if not moving.any() or (share := float(np.mean(same[moving]))) <= MAX_REPEATED:
+        repeated = _repeated(self.features[rows])
+        joint_steps = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1)
+        moving = joint_steps > MIN_JOINT_STEP
+        if not moving.any():
             return ""
-        found = (
-            f"{share:.0%} of the frames repeat another one although the arm moves, first in row "
-        )
-        return (
-            f"{found}{rows[1:][same & moving][0]}: give rows without a new frame feature_valid = 0"
-        )
+        share = float(np.mean(repeated[moving]))
+        if share <= MAX_REPEATED:
+            return ""
+        first = rows[1:][repeated & moving][0]
+        found = f"{share:.0%} of the frames repeat another one although the arm moves"
+        return f"{found}, first in row {first}: give rows without a new frame feature_valid = 0"
+
+
+def _repeated(features: FloatArray) -> BoolArray:
+    """Return which features (k, m), from the second one on, stand for no frame: (k − 1,).
+
+    A held feature equals the one before, and a placeholder, such as 0, comes again and again. A coarse detector repeats
+    features, too, but changes by its least step only; so there has to be a large change before or after.
+    """
+    steps = np.diff(features, axis=0)
+    changed = steps.any(axis=1)
+    changes = steps[changed]  # (c, m)
+    sizes = np.abs(changes)
+    least = sizes.min(axis=0, initial=np.inf, where=changes != 0.0)
+    large = (sizes > LARGE_CHANGE_RATIO * least).any(axis=1)
+    # Index i of the arrays of length c + 1 is the run of equal features after i changes.
+    beside_large = np.append(False, large) | np.append(large, True)
+    runs = np.cumsum(changed)
+    # Features leave for a placeholder and come back, as they do not in laps.
+    returned = np.linalg.norm(changes[:-1] + changes[1:], axis=1)
+    back = returned < 0.5 * np.linalg.norm(changes[1:], axis=1)
+    left_and_back = np.pad(back, 1)
+    _, kinds, counts = np.unique(features, axis=0, return_inverse=True, return_counts=True)
+    is_frequent = counts > max(2, MAX_REPEATED * len(features))
+    placeholder = is_frequent[kinds[1:]] & left_and_back[runs]
+    return np.asarray((~changed | placeholder) & beside_large[runs])
 
 
 def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:
@@ -159,53 +189,55 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     Raises:
         ConfigurationError: a column or a number is missing, or fewer than `least` frames are valid.
     """
-    names, rows = column_names(spec), np.arange(len(table))
+    names = column_names(spec)
+    rows = np.arange(len(table))
+    # A log may leave the features of a row without a new frame empty; their neighbours' stand in for them.
     frames = table.filter(names["feature"])
-    lost = frames.isna().all(axis=1)  # as a log may write a row without a new frame
-    table = table.assign(**frames.where(~lost, frames.ffill().bfill(), axis=0))
-    joints, features = (
-        numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature")
-    )
-    told = (
-        numbers_of(LOG, table, ["feature_valid"])[:, 0]
-        if "feature_valid" in table
-        else np.ones(len(rows))
-    )
-    valid = (told != 0.0) & ~lost.to_numpy()
+    lost = frames.isna().all(axis=1)
+    filled = frames.where(~lost, frames.ffill().bfill(), axis=0)
+    table = table.assign(**filled)
+    joints = numbers_of(LOG, table, names["joint_position"])
+    features = numbers_of(LOG, table, names["feature"])
+    marked = np.ones(len(rows))
+    if "feature_valid" in table:
+        marked = numbers_of(LOG, table, ["feature_valid"])[:, 0]
+    valid = (marked != 0.0) & ~lost.to_numpy()
+    commands = None
     lacking = [name for name in names[COMMAND] if name not in table]
-    if lacking and any(str(name).startswith(VELOCITY) for name in table):
-        remark(
-            f"the log has columns {VELOCITY}_… but no {', '.join(lacking)}: commands are left out"
-        )
-    commands = None if lacking else numbers_of(LOG, table, names[COMMAND])
+    if not lacking:
+        commands = numbers_of(LOG, table, names[COMMAND])
+    elif any(str(name).startswith(VELOCITY) for name in table):
+        missing = ", ".join(lacking)
+        remark(f"the log has columns {VELOCITY}_… but no {missing}: commands are left out")
     log = Log(spec, np.asarray(spec.period * rows), joints, features, valid, commands)
-    if (count := len(frames_of(log))) < least:
+    count = len(frames_of(log))
+    if count < least:
         after = f"after the first {MAX_LATENCY:g} s"
-        raise ConfigurationError(
-            f"the log has {count} valid frames {after}; wanted {least} or more"
-        )
+        wanted = f"wanted {least} or more"
+        raise ConfigurationError(f"the log has {count} valid frames {after}; {wanted}")
     return log
 
 
 def frames_of(log: Log, most: int = sys.maxsize) -> Any:  # noqa: ANN401 - of indices
     """Return the rows of frames that were exposed within the log at any latency: `most` at most, equally spaced."""
     rows = np.flatnonzero(log.valid & (log.time >= log.time[0] + MAX_LATENCY))
-    return rows[:: max(1, -(-len(rows) // most))]
+    stride = -(-len(rows) // most)  # rounded up
+    return rows[:: max(1, stride)]
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
     """A robot identified from a log."""
 
-    names: tuple[str, ...]  # of the parameters
+    names: tuple[str, ...]  # the parameters
     values: FloatArray  # θ, (p,), for the camera the difference from its nominal pose
-    covariance: FloatArray  # of the posterior, (p, p)
+    covariance: FloatArray  # covariance of the posterior, (p, p)
     told: BoolArray  # which parameters the log tells, (p,)
     factor: FloatArray  # (d, p), whose rows are the directions that the log tells; factorᵀ factor is their covariance
     untold: FloatArray  # (e, p), directions of θ that it does not tell, of length 1 in units of the priors
-    pose: FloatArray  # of the camera at θ, (4, 4)
+    pose: FloatArray  # pose of the camera at θ, (4, 4)
     noise: FloatArray  # Σ, (m, m)
-    residuals: FloatArray  # of all valid frames, (k, m)
+    residuals: FloatArray  # residuals of all valid frames, (k, m)
     rows: Any  # of these frames in the log, (k,)
     inliers: BoolArray  # which of them are no outliers, (k,)
     correlation: float  # f [frames]
@@ -218,15 +250,19 @@ class Identified:
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; 0 and infinite for one that the log does not have."""
-        where = [k for k, own in enumerate(self.names) if own == name]
-        return next(
-            ((float(self.values[k]), float(self.deviations[k])) for k in where), (0.0, np.inf)
-        )
+        if name not in self.names:
+            return 0.0, np.inf
+        k = self.names.index(name)
+        return float(self.values[k]), float(self.deviations[k])
+
+    def values_by_name(self) -> dict[str, float]:
+        """Return θ by name."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
 
     def sizes(self) -> dict[str, float]:
         """Return gears, zeros, links and tool by name, in deviations of their priors."""
-        known = zip(self.names, self.values.tolist(), strict=True)
-        return {name: value / prior(name) for name, value in known if name.startswith(ARM)}
+        values = self.values_by_name()
+        return {n: value / prior(n) for n, value in values.items() if n.startswith(ARM)}
 
     def unlikely(self) -> list[str]:
         """Return the names of those that are far from the nominal robot."""
@@ -234,26 +270,26 @@ class Identified:
 
     def rates(self, log: Log) -> FloatArray:
         """Return how fast the features of these frames move, (k, m), 1/s."""
-        return np.asarray(
-            np.gradient(log.features[self.rows] - self.residuals, log.time[self.rows], axis=0)
-        )
+        predicted = log.features[self.rows] - self.residuals
+        return np.asarray(np.gradient(predicted, log.time[self.rows], axis=0))
 
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
-        values = dict(zip(self.names, self.values.tolist(), strict=True))
+        values = self.values_by_name()
         deviating = {name: value for name, value in values.items() if not name.startswith("camera")}
         return deviated(nominal.with_camera(self.pose), deviating)
 
     def errors(self, log: Log, nominal: RobotModel) -> FloatArray:
         """Return the residuals of all valid frames of a log after the longest latency, (k, m)."""
-        rows, latency = frames_of(log), self.values[self.names.index("latency")]
+        rows = frames_of(log)
+        latency = self.values[self.names.index("latency")]
         joints = CubicSpline(log.time, log.joints)(log.time[rows] - latency)
         features = np.asarray(self.model(nominal).feature(joints))
         return np.asarray(log.features[rows] - features)
 
 
 def kind_of(name: str) -> str:
-    """Return the begin of a parameter's name, by which it has its unit and its prior."""
+    """Return the beginning of a parameter's name, by which it has its unit and its prior."""
     return "camera_turn" if name.startswith("camera_turn") else name.partition("_")[0]
 
 
@@ -262,54 +298,82 @@ def prior(name: str) -> float:
     return PRIORS[kind_of(name)]
 
 
+class _Evaluation(NamedTuple):
+    """The values that were computed for the residuals at one z."""
+
+    values: dict[str, float]  # θ by name
+    time: FloatArray  # when the frames were exposed, (k,) [s]
+    joints: FloatArray  # q, behind the gears then, (k, n) [rad]
+    model: RobotModel  # the robot at θ
+    frames: FloatArray  # frames of its arm at q
+
+
+class _Placed(NamedTuple):
+    """The camera where it fits best, among some latencies and speeds of turning."""
+
+    error: float  # median error [unit of the feature]
+    latency: float  # [s]
+    turning: float  # [rad/s]
+    pose: FloatArray  # (4, 4)
+
+
 class _Problem:
-    """Residuals of the valid frames of a log as a function of z = θ / s."""
+    """Residuals of the valid frames of a log as a function of z = θ / s.
+
+    Attributes:
+        rows: rows of these frames in the log, (k,).
+        time: when they arrived, (k,) [s].
+        y: their features, (k, m).
+        motion: joint positions over time, a spline.
+        names: the parameters θ.
+        scale: s, their prior deviations, (p,).
+        nominal: pose of the nominal camera, (4, 4).
+        model: the robot with the pose from which the camera deviates.
+        pace: angular frequency of the latency's swing [rad/s].
+        spread: median error of the first placement [unit of the feature].
+        z: where the search begins, (p,).
+    """
 
     def __init__(self, log: Log, model: RobotModel, most: int, begin: Mapping[str, float]) -> None:
+        """Place the camera where the nominal robot, changed by the parameters `begin`, fits a log best."""
+        self.log = log
         self.rows = frames_of(log, most)
-        self.time, self.y = log.time[self.rows], log.features[self.rows]
-        self.motion, self.log, self.middle = (
-            CubicSpline(log.time, log.joints),
-            log,
-            float(log.time.mean()),
-        )
-        pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
-        lens: tuple[str, ...] = () if pixels else LENS
-        self.names = tuple(
-            each
-            for each in parameter_names(model.arm)
-            if each not in ("command_delay", "lag", *lens)
-        )
-        self.names += EXTRAS[:5] if pixels else EXTRAS
+        self.time = log.time[self.rows]
+        self.y = log.features[self.rows]
+        self.motion = CubicSpline(log.time, log.joints)
+        self.middle = float(log.time.mean())
+        pixels = _sees_pixels(model)
+        self.names = _parameters(model, pixels=pixels)
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
-        self.model, self.pace, model = model, 1.0, deviated(model, begin)
-        # Z, pace and model of the last errors, and values computed for them
-        self._last: tuple[Any, Any] = (None, None)
+        self.model = model
+        self.pace = 1.0
+        # The last evaluation, and the z, pace and model that it belongs to.
+        self._last_key: Any = None
+        self._last: Any = None
+        first_guess = deviated(model, begin)
         latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
-        self.spread, latency, turning, pose = self._placed(
-            model, latencies, np.zeros_like(latencies)
-        )
+        placed = self._placed(first_guess, latencies, np.zeros_like(latencies))
+        latency = placed.latency
         if not pixels:
-            self.spread, _, turning, pose = self._placed(
-                model, np.full(len(TURNINGS), latency), TURNINGS
-            )
-        found = {**begin, "latency": latency, "turning": turning}
-        self.z = (
-            np.array([found.get(name, 0.0) for name in self.names]) / self.scale * ~self._of_camera
-        )
-        self.model = self.model.with_camera(pose)
+            placed = self._placed(first_guess, np.full(len(TURNINGS), latency), TURNINGS)
+        self.spread = placed.error
+        found = {**begin, "latency": latency, "turning": placed.turning}
+        start = np.array([found.get(name, 0.0) for name in self.names])
+        # The pose of the camera is that of the model, so its own parameters begin at 0.
+        self.z = start / self.scale * ~self._of_camera
+        self.model = self.model.with_camera(placed.pose)
 
-    def _placed(
-        self, model: RobotModel, latencies: FloatArray, turnings: FloatArray
-    ) -> tuple[float, float, float, FloatArray]:
-        """Return of some latencies and speeds of turning those with the least median error: it, both and the pose."""
+    def _placed(self, model: RobotModel, latencies: FloatArray, turnings: FloatArray) -> _Placed:
+        """Return the camera for the pair of latency and speed of turning, of (s,) each, with the least error."""
         exposed = self.time - latencies[:, None]
         y = turned(self.y, -turnings[:, None] * exposed) if turnings.any() else self.y
         poses, errors = fit_cameras(model, self.motion(exposed), y)
         best = int(errors.argmin())
-        return float(errors[best]), float(latencies[best]), float(turnings[best]), poses[best]
+        return _Placed(
+            float(errors[best]), float(latencies[best]), float(turnings[best]), poses[best]
+        )
 
     def values(self, z: FloatArray) -> dict[str, float]:
         """Return θ by name."""
@@ -317,76 +381,99 @@ class _Problem:
 
     def _exposed(self, values: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Return when the frames were exposed, (..., k) s, and the joints behind their gears then, (..., k, n) rad."""
-        steady = time = self.time - values["latency"] - values["drift"] * (self.time - self.middle)
-        swings = np.any([values["swing_sin"], values["swing_cos"]])
-        for _ in range(8 if swings else 0):  # the swing is that at the exposure
-            phase = self.pace * time
-            time = (
-                steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
-            )
-        ripple, backlash = (np.expand_dims(values[name], -1) for name in ("ripple", "backlash"))
-        return time, transmitted(self.motion(time), ripple, RIPPLE_ORDER) + backlash * self.play(
-            time
-        )
+        drift = values["drift"] * (self.time - self.middle)
+        steady = self.time - values["latency"] - drift
+        time = steady
+        swing_sin = values["swing_sin"]
+        swing_cos = values["swing_cos"]
+        if np.any([swing_sin, swing_cos]):
+            # The swing is that at the exposure, which depends on it: a fixed point.
+            for _ in range(8):
+                phase = self.pace * time
+                time = steady - swing_sin * np.sin(phase) - swing_cos * np.cos(phase)
+        ripple = np.expand_dims(values["ripple"], -1)
+        backlash = np.expand_dims(values["backlash"], -1)
+        geared = transmitted(self.motion(time), ripple, RIPPLE_ORDER)
+        return time, geared + backlash * self.play(time)
 
     def _seen(
         self, model: RobotModel, values: Mapping[str, float], time: FloatArray, ball: FloatArray
     ) -> FloatArray:
         """Return h, (..., k, m), by the camera of a model for the ball in the base frame, (..., k, 3) m."""
-        own: Any = model
-        y = (
-            own.feature_at(ball[..., None, :])
-            if isinstance(model, SetupModel)
-            else own.to_camera(ball)
-        )
+        y = _image(model, ball)
         if "turning" in values:
-            y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
+            # A soft tool lags behind by its compliance times the acceleration of the rigid one.
+            bent = y - values["compliance"] * self.pull(time)
+            y = turned(bent, values["turning"] * time)
         return np.asarray(y)
 
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
         values = self.values(z)
-        (time, q), model = self._exposed(values), deviated(self.model, values)
+        time, q = self._exposed(values)
+        model = deviated(self.model, values)
         frames = model.arm.frames(q)
-        self._last = (z.tobytes(), self.pace, self.model), (values, time, q, model, frames)
+        self._last_key = self._key(z)
+        self._last = _Evaluation(values, time, q, model, frames)
         return np.asarray(self.y - self._seen(model, values, time, model.arm.ball(frames)))
 
+    def _key(self, z: FloatArray) -> tuple[bytes, float, RobotModel]:
+        return z.tobytes(), self.pace, self.model
+
     def jacobian(self, z: FloatArray) -> FloatArray:
-        """Return ∂(y − h)/∂z, (p, k, m): of arm and camera by the chain rule, of others by differences."""
-        if self._last[0] != (z.tobytes(), self.pace, self.model):
+        """Return ∂(y − h)/∂z, (p, k, m): for arm and camera by the chain rule, for others by differences."""
+        if self._last_key != self._key(z):
             self.errors(z)
-        values, time, q, model, frames = self._last[1]
-        ball, motions = ball_rates(self.model, model.arm, q, frames)
+        at: _Evaluation = self._last
+        values = at.values
+        ball, motions = ball_rates(self.model, at.model.arm, at.joints, at.frames)
         by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
-        seen = self._seen(model, values, time, ball)
-        # A turned or moved camera sees what the other one would of a ball that moves the other way.
-        pose, turn, steps = model.camera, [values[name] for name in CAMERA[:3]], STEP * np.eye(3)
-        back, lever = (
-            pose[:3, :3] @ (self.model.camera[:3, :3] @ rotation_matrix(turn + steps)).mT,
-            ball - pose[:3, 3],
-        )
-        motions |= dict(zip(CAMERA, (*(lever @ back.mT - lever) / STEP, *-np.eye(3)), strict=True))
-        moved = self._seen(model, values, time, ball + steps[:, None])
-        by_ball = np.stack([*(moved - seen)], axis=-1) / STEP
+        h = self._seen(at.model, values, at.time, ball)
+        motions |= self._motions_by_camera(at.model.camera, values, ball)
+
+        # Chain rule: ∂h/∂z_i = s_i (∂h/∂ball) (∂ball/∂θ_i).
+        steps = STEP * np.eye(3)
+        displaced = self._seen(at.model, values, at.time, ball + steps[:, None])
+        by_ball = np.stack([*(displaced - h)], axis=-1) / STEP  # (k, m, 3)
         rates = {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
+
+        # Parameters of the exposure change the joints that a frame shows, and with them the ball.
         sizes = STEP * np.diag([prior(name) for name in EXPOSURE])[..., None]
-        then, joints = self._exposed(
-            values | {name: values[name] + s for name, s in zip(EXPOSURE, sizes, strict=True)}
-        )
-        found = self._seen(model, values, then, ball + np.matvec(by_joint, joints - q))
-        rates |= dict(zip(EXPOSURE, (found - seen) / STEP, strict=True))
+        later = {name: values[name] + size for name, size in zip(EXPOSURE, sizes, strict=True)}
+        time, joints = self._exposed(values | later)
+        shown = ball + np.matvec(by_joint, joints - at.joints)
+        by_exposure = (self._seen(at.model, values, time, shown) - h) / STEP
+        rates |= dict(zip(EXPOSURE, by_exposure, strict=True))
+
+        # The others are those of the lens and of what the camera sees of a ball in its place.
         for name in set(self.names) - set(rates):
-            other, eye = {**values, name: values[name] + STEP * prior(name)}, model
+            changed = {**values, name: values[name] + STEP * prior(name)}
+            camera = at.model
             if name in LENS:
-                eye = self.model.with_camera(pose).with_lens(
-                    np.array([other[each] for each in LENS])
-                )
-            rates[name] = (self._seen(eye, other, time, ball) - seen) / STEP
+                lens = np.array([changed[each] for each in LENS])
+                camera = self.model.with_camera(at.model.camera).with_lens(lens)
+            rates[name] = (self._seen(camera, changed, at.time, ball) - h) / STEP
         return -np.stack([rates[name] for name in self.names])
+
+    def _motions_by_camera(
+        self, pose: FloatArray, values: Mapping[str, float], ball: FloatArray
+    ) -> dict[str, FloatArray]:
+        """Return the motions of the ball that look like one of the camera, by the camera's parameters.
+
+        A turned or moved camera sees what the other one would of a ball that moves the other way.
+        """
+        turn = [values[name] for name in CAMERA[:3]]
+        turned_more = rotation_matrix(turn + STEP * np.eye(3))
+        back = pose[:3, :3] @ (self.model.camera[:3, :3] @ turned_more).mT
+        lever = ball - pose[:3, 3]
+        by_turn = (lever @ back.mT - lever) / STEP
+        by_place = -np.eye(3)
+        return dict(zip(CAMERA, (*by_turn, *by_place), strict=True))
 
     def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
         """Return residuals with their weights (k,) and Σ^{-1/2}, and z for its prior."""
-        return np.concatenate([(weights[:, None] * self.errors(z) @ root.T).ravel(), z])
+        white = weights[:, None] * self.errors(z) @ root.T
+        return np.concatenate([white.ravel(), z])
 
     def weighted_jacobian(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the derivatives of `weighted` by z, (k m + p, p)."""
@@ -398,55 +485,98 @@ class _Problem:
         return np.asarray(deviated(self.model, self.values(z)).camera)
 
     def recentred(self, z: FloatArray) -> FloatArray:
-        """Take the pose of the camera for that from which it deviates, and return the z that is left."""
-        self.model, values = self.model.with_camera(self.pose(z)), self.values(z)
-        size = max(abs(values["backlash"]), MIN_PLAY)
+        """Take the pose of the camera for that from which it deviates, and return the z that is left.
+
+        The effects of play and of a soft tool are linearised anew about this z, too.
+        """
+        self.model = self.model.with_camera(self.pose(z))
+        values = self.values(z)
+        play = max(abs(values["backlash"]), MIN_PLAY)
         gears = transmitted(self.log.joints, values["ripple"], RIPPLE_ORDER)
-        self.play = CubicSpline(self.log.time, played(gears, size) / size)
+        self.play = CubicSpline(self.log.time, played(gears, play) / play)
         rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
         self.pull = CubicSpline(self.log.time, rigid.feature(self.log.joints)).derivative(2)
         return np.asarray(z * ~self._of_camera)
 
     def swung(self, z: FloatArray) -> FloatArray:
-        """Take the period with which the latency swings most likely, and return the z with the sizes there."""
+        """Take the period with which the latency swings most likely, and return the z with the sizes there.
+
+        Each frame tells its own lateness along ∂h/∂latency; a sine and a cosine of each period are fitted to these.
+        """
         swings = [name.startswith("swing") for name in self.names]
-        error = self.errors(z := np.where(swings, 0.0, z))
+        z = np.where(swings, 0.0, z)
+        error = self.errors(z)
         rates = self.jacobian(z)[self.names.index("latency")] / prior("latency")
         weight = np.sum(rates**2, axis=1) + 1e-12
-        late = -np.sum(rates * error, axis=1) / weight
-        weight = np.sqrt(weight / (1.0 + (late / np.median(np.abs(late))) ** 2))
-        found: list[tuple[float, float, list[float]]] = []
-        for pace in 2.0 * np.pi / SWINGS[np.ptp(self.time) > SWINGS_IN_LOG * SWINGS]:
-            waves = (
-                np.stack([np.sin(pace * self.time), np.cos(pace * self.time)], axis=1)
-                * weight[:, None]
-            )
-            sizes = np.linalg.lstsq(waves, late * weight, rcond=None)[0]
-            found.append(
-                (float(np.sum((late * weight - waves @ sizes) ** 2)), pace, sizes.tolist())
-            )
-        _, self.pace, sizes = min(found, default=(0.0, self.pace, [0.0, 0.0]))
-        z[swings] = np.array(sizes) / prior("swing")
+        late = -np.sum(rates * error, axis=1) / weight  # [s] of each frame
+        # Cauchy weights, so that outliers count little.
+        scaled = late / np.median(np.abs(late))
+        weight = np.sqrt(weight / (1.0 + scaled**2))
+        target = late * weight
+        fits: list[tuple[float, float, list[float]]] = []
+        fitting = SWING_PERIODS[np.ptp(self.time) > MIN_SWINGS * SWING_PERIODS]
+        for pace in 2.0 * np.pi / fitting:
+            phase = pace * self.time
+            waves = np.stack([np.sin(phase), np.cos(phase)], axis=1) * weight[:, None]
+            sizes = np.linalg.lstsq(waves, target, rcond=None)[0]
+            left = float(np.sum((target - waves @ sizes) ** 2))
+            fits.append((left, pace, sizes.tolist()))
+        if fits:
+            _, self.pace, best = min(fits)
+            z[swings] = np.array(best) / prior("swing")
+        else:
+            z[swings] = 0.0
         return z
 
     def differences(self, z: FloatArray) -> FloatArray:
         """Return θ, for the camera the difference from its nominal pose in the same form."""
-        values, pose = self.scale * z, self.pose(z)
+        values = self.scale * z
+        pose = self.pose(z)
         turn = Rotation.from_matrix(self.nominal[:3, :3].T @ pose[:3, :3]).as_rotvec()
         values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
         return values
 
 
+def _sees_pixels(model: RobotModel) -> bool:
+    return isinstance(model, SetupModel) and model.setup.name == PIXEL.name
+
+
+def _image(model: RobotModel, ball: FloatArray) -> FloatArray:
+    """Return the features of balls in the base frame, (..., k, 3) m, before any turning of the camera."""
+    if isinstance(model, SetupModel):
+        return model.feature_at(ball[..., None, :])
+    places: Any = model  # whose features are places in the camera frame
+    return np.asarray(places.to_camera(ball))
+
+
+def _parameters(model: RobotModel, *, pixels: bool) -> tuple[str, ...]:
+    """Return the names of θ: those of a twin but for the drive, of the lens only where features are pixels."""
+    lacking = {"command_delay", "lag"}
+    extras: tuple[str, ...] = TOLD_BY_PIXELS
+    if not pixels:
+        lacking.update(LENS)
+        extras = EXTRAS
+    own = [name for name in parameter_names(model.arm) if name not in lacking]
+    return (*own, *extras)
+
+
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
     """Return places (..., k, 3) as cameras see them that are turned about the optical axis by angles (..., k) [rad]."""
-    (x, y, z), c, s = np.moveaxis(places, -1, 0), np.cos(angle), np.sin(angle)
+    x, y, z = np.moveaxis(places, -1, 0)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1)
 
 
 def played(joints: FloatArray, size: float) -> FloatArray:
     """Return by how much joints (k, n) behind gears with a play of ±size are elsewhere, (k, n) [rad]."""
-    mechanics, x = MechanicsConfig(backlash=size), joints[0]
-    behind = np.array([x := mechanics.driven(x, q) for q in joints])
+    mechanics = MechanicsConfig(backlash=size)
+    # A joint stays where it is until its gear has crossed the play, so each row depends on the one before.
+    behind = np.empty(joints.shape)
+    x = joints[0]
+    for k, q in enumerate(joints):
+        x = mechanics.driven(x, q)
+        behind[k] = x
     return behind - joints
 
 
@@ -457,64 +587,76 @@ def fit_cameras(
 
     Args:
         model: nominal robot with one camera.
-        joints: of s logs, (s, k, n) [rad].
+        joints: joint positions of s logs, (s, k, n) [rad].
         features: (s, k, 3) m, places of the ball, or (s, k, 2) px, its pixels; without s the same for all.
     """
     features = np.broadcast_to(features, (*joints.shape[:2], features.shape[-1]))
-    pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
-    most = max(1, ROWS_AT_ONCE // joints.shape[1])
-    fit: Any = _by_pixels if pixels else _by_places
-    starts = range(0, len(joints), most)
-    poses, errors = zip(
-        *(fit(model, joints[k : k + most], features[k : k + most]) for k in starts), strict=True
-    )
+    logs_at_once = max(1, ROWS_AT_ONCE // joints.shape[1])
+    fit: Any = _by_pixels if _sees_pixels(model) else _by_places
+    poses = []
+    errors = []
+    for first in range(0, len(joints), logs_at_once):
+        part = slice(first, first + logs_at_once)
+        own_poses, own_errors = fit(model, joints[part], features[part])
+        poses.append(own_poses)
+        errors.append(own_errors)
     return np.concatenate(poses), np.concatenate(errors)
 
 
 def _by_pixels(
     model: SetupModel, joints: FloatArray, features: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
+    """Return the poses by perspective-n-point with RANSAC; see `fit_cameras`."""
     import cv2  # noqa: PLC0415 - a tenth of a second
 
-    matrix, poses, errors = (
-        np.eye(3),
-        np.tile(np.eye(4), (len(joints), 1, 1)),
-        np.zeros(len(joints)),
-    )
-    matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
-    wide = (
-        model.optics.further is not None and model.optics.further.shape[-1] > COLUMNS["plumb_bob"]
-    )
+    optics = model.optics
+    matrix = np.eye(3)
+    matrix[[0, 1], [0, 1]] = optics.focal_lengths[0]
+    matrix[:2, 2] = optics.centre[0]
+    poses = np.tile(np.eye(4), (len(joints), 1, 1))
+    errors = np.zeros(len(joints))
+    # OpenCV knows none of the lenses with more coefficients: their pixels become those of a pinhole.
+    further = optics.further
+    wide = further is not None and further.shape[-1] > COLUMNS["plumb_bob"]
     for k, (q, y) in enumerate(zip(joints, features, strict=True)):
         points = np.ascontiguousarray(model.points(q)[:, 0])
         flat = y.copy()
         if wide:
-            rays = locate(y[:, None, None], np.ones((len(y), 1, 1)), model.optics)[:, 0, 0]
+            rays = locate(y[:, None, None], np.ones((len(y), 1, 1)), optics)[:, 0, 0]
             flat = np.ascontiguousarray((rays @ matrix.T)[:, :2])
         found, turn, place, _ = cv2.solvePnPRansac(
             points, flat, matrix, None, reprojectionError=20.0
         )
         if found:
-            poses[k, :3, :3], poses[k, :3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
-        poses[k] = np.linalg.inv(poses[k]) if found else model.camera
-        errors[k] = np.median(np.linalg.norm(model.with_camera(poses[k]).feature(q) - y, axis=1))
+            # OpenCV returns the base in the camera frame.
+            poses[k, :3, :3] = cv2.Rodrigues(turn)[0]
+            poses[k, :3, 3] = place[:, 0]
+            poses[k] = np.linalg.inv(poses[k])
+        else:
+            poses[k] = model.camera
+        misses = model.with_camera(poses[k]).feature(q) - y
+        errors[k] = np.median(np.linalg.norm(misses, axis=1))
     return poses, errors
 
 
 def _by_places(
     model: RobotModel, joints: FloatArray, features: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    points, poses = model.arm.ball_position(joints), np.tile(np.eye(4), (len(joints), 1, 1))
+    """Return the poses by Kabsch's rotation with the weights of Weiszfeld's median; see `fit_cameras`."""
+    points = model.arm.ball_position(joints)
     weights = np.ones(points.shape[:2])
-    for _ in range(5):  # Kabsch's rotation with the weights of Weiszfeld's median
+    for _ in range(WEISZFELD_STEPS):
         share = (weights / weights.sum(axis=1, keepdims=True))[:, None]
-        middle, mean = share @ points, share @ features
+        middle = share @ points
+        mean = share @ features
         R = nearest_rotation((points - middle).mT @ ((features - mean) * share.mT))
         place = middle - mean @ R.mT
         distance = np.linalg.norm(features - (points - place) @ R, axis=2)
         errors = np.median(distance, axis=1)
         weights = 1.0 / np.maximum(distance, errors[:, None] + 1e-9)
-    poses[:, :3, :3], poses[:, :3, 3] = R, place[:, 0]
+    poses = np.tile(np.eye(4), (len(joints), 1, 1))
+    poses[:, :3, :3] = R
+    poses[:, :3, 3] = place[:, 0]
     return poses, errors
 
 
@@ -528,7 +670,7 @@ def identify(
     """Identify a robot from a log.
 
     Args:
-        log: of a robot with one fixed camera.
+        log: rows of a robot with one fixed camera.
         model: nominal robot under the sensing of the log, position or pixel.
         most: frames that are used, at equal distances.
         fits: number of fits, the last without a robust loss.
@@ -537,52 +679,76 @@ def identify(
     Raises:
         ConfigurationError: another sensing.
     """
-    sensing = model.setup.name if isinstance(model, SetupModel) else POSITION.name
-    if sensing not in (POSITION.name, PIXEL.name) or (
-        isinstance(model, SetupModel) and model.mount != "fixed"
-    ):
-        wanted = "logs with --sensing position or pixel, of a fixed camera"
-        raise ConfigurationError(f"identify takes {wanted}; got {sensing}")
+    _check_sensing(model)
     problem = _Problem(log, model, most, begin or {})
+    z = problem.z
     inliers = np.ones(len(problem.rows), dtype=np.bool_)
-    noise, z = (
-        np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2,
-        problem.z,
-    )
+    deviation = max(problem.spread, 1e-4 * log.spec.feature.scale)
+    noise = np.eye(log.spec.m) * deviation**2
+    robust_tolerance, last_tolerance = RELATIVE_TOLERANCES
     for left in reversed(range(fits)):
-        root, z = np.linalg.inv(np.linalg.cholesky(noise)), problem.recentred(z)
+        root = np.linalg.inv(np.linalg.cholesky(noise))
+        z = problem.recentred(z)
         if left == 1:
             z = problem.swung(z)
         distances = np.sum((problem.errors(z) @ root.T) ** 2, axis=1)
-        weights = np.asarray((1.0 + distances) ** -0.25 if left else inliers, dtype=np.float64)
+        if left:
+            # The square roots of the weights of a soft L1 loss.
+            weights = np.asarray((1.0 + distances) ** -0.25, dtype=np.float64)
+            tolerance = robust_tolerance
+        else:
+            weights = np.asarray(inliers, dtype=np.float64)
+            tolerance = last_tolerance
         solved: Any = least_squares(
             partial(problem.weighted, root=root, weights=weights),
-            z, partial(problem.weighted_jacobian, root=root, weights=weights),
-            method="lm", max_nfev=5 * fits * len(z), ftol=1e-4 if left else 1e-6, xtol=1e-6,
-        )  # fmt: skip
+            z,
+            partial(problem.weighted_jacobian, root=root, weights=weights),
+            method="lm",
+            max_nfev=MAX_EVALUATIONS * fits * len(z),
+            ftol=tolerance,
+            xtol=1e-6,
+        )
         z = solved.x
         noise, inliers = robust_covariance(problem.errors(z))
-    return _posterior(problem, z, solved.jac[: -len(z)])
+    without_prior = solved.jac[: -len(z)]
+    return _posterior(problem, z, without_prior)
+
+
+def _check_sensing(model: RobotModel) -> None:
+    """Refuse a model whose camera cannot be identified."""
+    sensing = POSITION.name
+    fixed = True
+    if isinstance(model, SetupModel):
+        sensing = model.setup.name
+        fixed = model.mount == "fixed"
+    if sensing not in (POSITION.name, PIXEL.name) or not fixed:
+        wanted = "logs with --sensing position or pixel, of a fixed camera"
+        raise ConfigurationError(f"identify takes {wanted}; got {sensing}")
 
 
 def _posterior(problem: _Problem, z: FloatArray, jacobian: FloatArray) -> Identified:
-    """Return the robot at z with its uncertainty, given the Jacobian of the residuals, (k m, p)."""
-    errors, s, unit = problem.errors(z), problem.scale, np.eye(len(z))
+    """Return the robot at z with its uncertainty, given the Jacobian of the residuals, (k m, p).
+
+    In z the prior is N(0, I): its information is I, and I/4 with twice the width.
+    """
+    errors = problem.errors(z)
     noise, inliers = robust_covariance(errors)
-    correlation = correlation_time(
-        (errors @ np.linalg.inv(np.linalg.cholesky(noise)).T) * inliers[:, None]
-    )
+    white = errors @ np.linalg.inv(np.linalg.cholesky(noise)).T
+    correlation = correlation_time(white * inliers[:, None])
     information = jacobian.T @ jacobian / correlation
+    unit = np.eye(len(z))
     covariance = np.linalg.inv(information + unit)
     wider = np.linalg.inv(information + unit / 4.0)
+    growth = np.sqrt(np.diag(wider) / np.diag(covariance))
     eigenvalues, directions = np.linalg.eigh(information)
-    shares = 1.0 / np.sqrt(1.0 + eigenvalues)
-    known = shares < TOLD_SHARE
+    shares = 1.0 / np.sqrt(1.0 + eigenvalues)  # posterior over prior deviation of each direction
+    known = shares < MAX_PRIOR_SHARE
+    s = problem.scale
     return Identified(
         names=problem.names,
         values=problem.differences(z),
         covariance=s[:, None] * covariance * s,
-        told=np.sqrt(np.diag(wider) / np.diag(covariance)) < TOLD,
+        told=growth < MAX_PRIOR_EFFECT,
         factor=shares[known, None] * directions.T[known] * s,
         untold=directions.T[~known],
         pose=problem.pose(z),
@@ -600,14 +766,18 @@ def robust_covariance(errors: FloatArray) -> tuple[FloatArray, BoolArray]:
     spread = 1.4826 * np.median(np.abs(errors), axis=0) + 1e-12
     inliers = np.sum((errors / spread) ** 2, axis=1) < OUTLIER
     for _ in range(5):
+        # NumPy multiplies an array with its own transpose by another routine, with other last bits: hence two copies.
         covariance = errors[inliers].T @ errors[inliers] / max(int(inliers.sum()), 1)
-        inliers = np.einsum("ki,ij,kj->k", errors, np.linalg.inv(covariance), errors) < OUTLIER
+        distances = np.einsum("ki,ij,kj->k", errors, np.linalg.inv(covariance), errors)
+        inliers = distances < OUTLIER
     return covariance, inliers
 
 
 def correlation_time(white: FloatArray) -> float:
     """Return 1 + 2 Σ ρ_l of white residuals (k, m) [frames], at least 1, up to the first ρ_l below 2/√k."""
-    total, square, count = 1.0, float(np.sum(white**2)), len(white)
+    total = 1.0
+    square = float(np.sum(white**2))
+    count = len(white)
     for lag in range(1, min(MAX_LAGS, count // 4)):
         share = float(np.sum(white[lag:] * white[:-lag])) / square
         if share < 2.0 / (count * white.shape[1]) ** 0.5:

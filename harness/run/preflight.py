@@ -24,29 +24,33 @@ from servobench.harness.run.identification import (
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
-MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the nominal robot
+# Features in m that move farther than the nominal robot's by this factor are in another unit.
+MAX_MOTION_RATIO: Final = 20.0  # [1]
 UNITS: Final = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
-UNEXPLAINED: Final = (
-    1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
+# Something is wrong if residuals exceed the noise from frame to frame by this factor.
+MAX_NOISE_RATIO: Final = 1.5  # [1]
+# Errors that nothing explains are refused from this share of the motion of features on.
+REFUSED_SHARE: Final = 0.1  # [1]
+# Residuals below this share of the motion of features are small in any case.
+MIN_SHARE: Final = 0.01  # [1]
+# One remedy explains a log if it leaves less than this share of the misfit, two if they leave less of that of one.
+REMEDY_GAIN: Final = 0.8  # [1]
+PAIR_GAIN: Final = 0.5  # [1]
+# A log cannot tell mistakes apart whose remedies leave at most this many times the least misfit.
+TIE_RATIO: Final = 1.1  # [1]
+SCREENED: Final = 6  # number of remedies that are fitted, those with the least errors
+REMEDIES_AT_ONCE: Final = 64  # remedies for which cameras are placed side by side
+FRAMES: Final = 150  # frames for fits of remedies
+FRAMES_FOR_ZEROS: Final = FRAMES // 3
+MIN_DRIFT: Final = (
+    10.0  # [ms] between clocks, at once or over the log, from which they count as apart
 )
-REFUSED_SHARE: Final = (
-    0.1  # [1] of the motion of features, from which errors that nothing explains are refused
-)
-MIN_SHARE: Final = (
-    0.01  # [1] of the motion of features, below which residuals are small in any case
-)
-GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
-PAIR_GAIN: Final = 0.5  # [1] of the residual of one mistake, below which two explain it
-TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
-SCREENED: Final = 6  # mistakes that are looked at closely
-AT_ONCE: Final = 64  # logs without a mistake that are placed before a camera side by side
-FRAMES: Final = 150  # frames of a close look
-DRIFT: Final = 10.0  # [ms] at once or over the log, from which clocks are apart
-CERTAIN: Final = 6.0  # [1] standard deviations
-SEARCHES: Final = 20  # of joint zeros
+CERTAIN: Final = 6.0  # [1] standard deviations from none that leave no doubt
+ZERO_SEARCHES: Final = 20  # random starts of the search for joint zeros
 ANGLES: Final = np.radians([-120, -90, -60, -30, 30, 60, 90, 120, 180, -10, 10]).tolist()
-PARTS: Final = 16  # of the log, between which the camera may have moved
-JUMP: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
+PARTS: Final = 16  # parts of the log, between which the camera may have moved
+JUMP_RATIO: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
+
 Others = Callable[[], Mapping[str, RobotModel]]
 
 
@@ -66,37 +70,51 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         model: nominal robot under the sensing of the log.
         others: returns the nominal models of other arms by name; called for a log with a mistake.
     """
-    found = log.joint_mistake() or log.first_jump()[0] or _units(log, model) or log.frame_mistake()
+    jump, _ = log.first_jump()
+    found = log.joint_mistake() or jump or _units(log, model) or log.frame_mistake()
     if found:
         return found, None
     robot = identify(log, model)
     if not _is_noise(log, robot):
-        if found := _moved(log, model):
+        found = _moved(log, model)
+        if found:
             return found, None
         other = identify(log, model, begin=_zeros(log, model))
-        robot = other if _is_noise(log, other) else robot
+        if _is_noise(log, other):
+            robot = other
     found = _clocks(log, robot)
     if not is_explained(log, robot):
-        known = (
-            dict(zip(robot.names, robot.values.tolist(), strict=True))
-            if _is_noise(log, robot)
-            else {}
-        )
-        found = _undone(log, model, others, known) or found
-        if not found and (large := _large_errors(log, robot)):
-            found = next(
-                filter(None, (_undone(half, model, others, {}) for half, _ in _halves(log))), large
-            )
+        known = robot.values_by_name() if _is_noise(log, robot) else {}
+        found = _named_remedies(log, model, others, known) or found
+        if not found:
+            found = _large_errors_named(log, robot, model, others)
     return found, None if found else robot
 
 
+def _large_errors_named(log: Log, robot: Identified, model: RobotModel, others: Others) -> str:
+    """Name large errors by the mistakes of one half of the log, if there are any; empty for small errors."""
+    large = _large_errors(log, robot)
+    if not large:
+        return ""
+    for half, _ in _halves(log):
+        found = _named_remedies(half, model, others, {})
+        if found:
+            return found
+    return large
+
+
 def noise_of(log: Log) -> FloatArray:
-    """Return the deviation of a feature's noise, (m,), from third differences of successive frames; 0 for too few."""
+    """Return the deviation of a feature's noise, (m,), from third differences of successive frames; 0 for too few.
+
+    The third difference of white noise, y_3 − 3 y_2 + 3 y_1 − y_0, has 1 + 9 + 9 + 1 = 20 times its variance.
+    """
     rows = frames_of(log)
-    follow = np.flatnonzero((rows[3:] - rows[:-3]) == 3 * int(np.median(np.diff(rows))))
-    if not follow.size:
+    usual_gap = int(np.median(np.diff(rows)))
+    spans = rows[3:] - rows[:-3]
+    successive = np.flatnonzero(spans == 3 * usual_gap)
+    if not successive.size:
         return np.zeros(log.spec.m)
-    third = np.diff(log.features[rows], n=3, axis=0)[follow]
+    third = np.diff(log.features[rows], n=3, axis=0)[successive]
     return np.asarray(1.4826 * np.median(np.abs(third), axis=0) / math.sqrt(20.0))
 
 
@@ -106,58 +124,67 @@ def is_explained(log: Log, robot: Identified) -> bool:
 
 
 def _is_noise(log: Log, robot: Identified) -> bool:
+    """Return whether residuals are not far above the noise, or small beside the motion, for most of the frames."""
     spread = np.sqrt(np.diag(robot.noise))
-    rest = (spread > UNEXPLAINED * noise_of(log)) & (_shares(log, robot) > MIN_SHARE)
+    above_noise = spread > MAX_NOISE_RATIO * noise_of(log)
+    rest = above_noise & (_shares(log, robot) > MIN_SHARE)
     return bool(not rest.any() and robot.inliers.mean() > 0.5)
 
 
 def _shares(log: Log, robot: Identified) -> FloatArray:
     """Return the errors of a feature over its motion, (m,)."""
-    return np.asarray(
-        np.sqrt(np.diag(robot.noise)) / np.std(log.features[robot.rows], axis=0).max()
-    )
+    motion = np.std(log.features[robot.rows], axis=0).max()
+    return np.asarray(np.sqrt(np.diag(robot.noise)) / motion)
 
 
 def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
-    """Return zeros of the joints, by a search along one after the other with the camera where it fits."""
-    rows, draws, n = frames_of(log, FRAMES // 3), np.random.default_rng(0), log.spec.n
-    q, y = log.joints[rows], log.features[rows]
-    zeros, errors = draws.uniform(-math.pi, math.pi, (SEARCHES, n)), np.full(SEARCHES, np.inf)
-    left = np.arange(SEARCHES)
-    while left.size:
-        before = errors[left]
+    """Return zeros of the joints, by a search along one after the other with the camera where it fits.
+
+    Searches from random zeros go on side by side, until none finds a smaller error any more.
+    """
+    rows = frames_of(log, FRAMES_FOR_ZEROS)
+    q = log.joints[rows]
+    y = log.features[rows]
+    n = log.spec.n
+    generator = np.random.default_rng(0)
+    zeros = generator.uniform(-math.pi, math.pi, (ZERO_SEARCHES, n))
+    errors = np.full(ZERO_SEARCHES, np.inf)
+    active = np.arange(ZERO_SEARCHES)
+    while active.size:
+        before = errors[active]
         for joint in range(1, n - 1):  # the first and the last one turn camera and ball
-            tried = np.repeat(zeros[left, None], len(ANGLES), axis=1)
+            tried = np.repeat(zeros[active, None], len(ANGLES), axis=1)
             tried[..., joint] += ANGLES
             _, found = fit_cameras(model, q + tried.reshape(-1, 1, n), y)
-            found = found.reshape(len(left), -1)
-            best, less = found.argmin(axis=1), found.min(axis=1) < errors[left]
-            zeros[left[less]], errors[left[less]] = tried[less, best[less]], found[less, best[less]]
-        left = left[errors[left] < before]
-    zero = (zeros[errors.argmin()] + math.pi) % (2.0 * math.pi) - math.pi
-    return {
-        f"zero_{name}": each for name, each in zip(log.spec.joint_names, zero.tolist(), strict=True)
-    }
+            found = found.reshape(len(active), -1)
+            best = found.argmin(axis=1)
+            better = np.flatnonzero(found.min(axis=1) < errors[active])
+            zeros[active[better]] = tried[better, best[better]]
+            errors[active[better]] = found[better, best[better]]
+        active = active[errors[active] < before]
+    # Each zero within half a turn of none.
+    nearest = (zeros[errors.argmin()] + math.pi) % (2.0 * math.pi) - math.pi
+    names = [f"zero_{name}" for name in log.spec.joint_names]
+    return dict(zip(names, nearest.tolist(), strict=True))
 
 
 def _units(log: Log, model: RobotModel) -> str:
     """Name features that are likely in a smaller unit than m."""
     rows = frames_of(log)
-    made, moved = (
-        np.linalg.norm(_spread(each))
-        for each in (model.feature(log.joints[rows]), log.features[rows])
-    )
-    if log.spec.feature.unit == "m" and moved > MAX_RATIO * made:
-        found = f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m"
-        unit = min(
-            UNITS, key=lambda unit: abs(math.log(moved / max(float(made), 1e-9) * UNITS[unit]))
-        )
-        return f"{found}: they are likely in {unit}; write them in m"
-    return ""
+    modelled = float(np.linalg.norm(_spread(model.feature(log.joints[rows]))))
+    logged = float(np.linalg.norm(_spread(log.features[rows])))
+    if log.spec.feature.unit != "m" or logged <= MAX_MOTION_RATIO * modelled:
+        return ""
+    ratio = logged / max(modelled, 1e-9)
+    unit = min(UNITS, key=lambda unit: abs(math.log(ratio * UNITS[unit])))
+    found = f"features move by {logged:.3g} where this arm moves its ball by {modelled:.3g} m"
+    return f"{found}: they are likely in {unit}; write them in m"
 
 
 def _spread(values: FloatArray) -> FloatArray:
-    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
+    """Return the robust standard deviation of values (k, m), by the median of their distances from the median: (m,)."""
+    distances = np.abs(values - np.median(values, axis=0))
+    return np.asarray(1.4826 * np.median(distances, axis=0))
 
 
 def _large_errors(log: Log, robot: Identified) -> str:
@@ -172,101 +199,133 @@ def _large_errors(log: Log, robot: Identified) -> str:
 def _clocks(log: Log, robot: Identified) -> str:
     """Name clocks of which one is behind the other, or gains on it."""
     latency, deviation = robot.estimate("latency")
-    if 1e3 * latency < -max(CERTAIN * 1e3 * deviation, DRIFT):
+    if 1e3 * latency < -max(CERTAIN * 1e3 * deviation, MIN_DRIFT):
         before = f"frames come {-1e3 * latency:.0f} ms before the joints are where they show them"
         return f"{before}, as clocks of camera and joints are apart: stamp both with one"
     drift, deviation = robot.estimate("drift")
-    time, rates = log.time[robot.rows], robot.rates(log) * robot.inliers[:, None]
-    shifts, speeds = np.sum(rates * robot.residuals, axis=1), np.sum(rates**2, axis=1)
-    weights = time - np.average(time, weights=speeds)  # of the lateness of each frame in the drift
-    scatter = math.sqrt(robot.correlation * np.sum((weights * shifts) ** 2)) / float(
-        np.sum(weights**2 * speeds)
-    )
-    deviation = max(deviation, scatter)  # larger where fast frames are late by changing times
+    # Larger where fast frames are late by changing times.
+    deviation = max(deviation, _drift_scatter(log, robot))
     total = 1e3 * float(np.ptp(log.time))  # [ms]
-    if abs(drift) < max(CERTAIN * deviation, DRIFT / total):
+    if abs(drift) < max(CERTAIN * deviation, MIN_DRIFT / total):
         return ""
-    word = f"{abs(drift) * total:.0f} ± {1.96 * deviation * total:.1g} ms {'later' if drift > 0.0 else 'earlier'}"
-    return f"frames come {word} at the end than at the begin, as clocks of camera and joints drift: stamp both with one"
+    size = f"{abs(drift) * total:.0f} ± {1.96 * deviation * total:.1g} ms"
+    word = "later" if drift > 0.0 else "earlier"
+    found = f"frames come {size} {word} at the end than at the beginning"
+    return f"{found}, as clocks of camera and joints drift: stamp both with one"
+
+
+def _drift_scatter(log: Log, robot: Identified) -> float:
+    """Return the deviation of the drift by the scatter of each frame's lateness.
+
+    A frame that is late by s leaves a residual s ẏ: the drift is the slope of s over time, weighted with ‖ẏ‖².
+    """
+    time = log.time[robot.rows]
+    rates = robot.rates(log) * robot.inliers[:, None]
+    shifts = np.sum(rates * robot.residuals, axis=1)  # s ‖ẏ‖²
+    speeds = np.sum(rates**2, axis=1)  # ‖ẏ‖²
+    weights = time - np.average(time, weights=speeds)
+    noise = math.sqrt(robot.correlation * np.sum((weights * shifts) ** 2))
+    return noise / float(np.sum(weights**2 * speeds))
 
 
 def _moved(log: Log, model: RobotModel) -> str:
     """Name a camera that was moved during the log: one half is explained, and errors of its robot jump in the other."""
     rows = frames_of(log)
     for half, way in _halves(log):
-        if not is_explained(half, robot := identify(half, model)):
+        robot = identify(half, model)
+        if not is_explained(half, robot):
             continue
         errors = np.linalg.norm(robot.errors(log, model), axis=1)
         sizes = np.array([np.median(each) for each in np.array_split(errors, PARTS)])
         growth = (sizes[1:] / sizes[:-1]) ** way
-        if growth.max() > JUMP:
-            row = rows[(int(growth.argmax()) + 1) * len(rows) // PARTS]
-            size, unit = float(np.median(errors[(rows - row) * way >= 0])), log.spec.feature.unit
-            jump = f"features jump by {size:.2g} {unit} about {log.time[row]:.0f} s after the begin"
-            shift = _shift(log, model, log.time[row])
-            if abs(shift) > 0.5 * log.spec.period:
-                frames = f"frames come {1e3 * shift:+.0f} ms later from there on, as where one is lost or doubled"
-                return f"{jump}: {frames}; cut the log there, or shift them"
-            return (
-                f"{jump}: the camera or the ball was moved, or a frame is lost; cut the log there"
-            )
+        if growth.max() <= JUMP_RATIO:
+            continue
+        part = int(growth.argmax()) + 1
+        row = rows[part * len(rows) // PARTS]
+        size = float(np.median(errors[(rows - row) * way >= 0]))
+        time = log.time[row]
+        unit = log.spec.feature.unit
+        jump = f"features jump by {size:.2g} {unit} about {time:.0f} s after the beginning"
+        shift = _shift(log, model, time)
+        if abs(shift) > 0.5 * log.spec.period:
+            frames = f"frames come {1e3 * shift:+.0f} ms later from there on, as where one is lost or doubled"
+            return f"{jump}: {frames}; cut the log there, or shift them"
+        causes = "the camera or the ball was moved, or a frame is lost"
+        return f"{jump}: {causes}; cut the log there"
     return ""
 
 
 def _shift(log: Log, model: RobotModel, time: float) -> float:
     """Return by how much the latency grows at a time [s]; 0 where a side has too few frames to tell it."""
-    sides = (log.time < time, log.time >= time)
-    parts = [log._replace(valid=log.valid & side) for side in sides]
-    if min(len(frames_of(part)) for part in parts) < MIN_FRAMES:
+    before = log._replace(valid=log.valid & (log.time < time))
+    after = log._replace(valid=log.valid & (log.time >= time))
+    if min(len(frames_of(before)), len(frames_of(after))) < MIN_FRAMES:
         return 0.0
-    before, after = (identify(part, model).estimate("latency")[0] for part in parts)
-    return after - before
+    latency_before, _ = identify(before, model).estimate("latency")
+    latency_after, _ = identify(after, model).estimate("latency")
+    return latency_after - latency_before
 
 
 def _halves(log: Log) -> Iterator[tuple[Log, int]]:
     """Yield the log with the frames of each half, if they are enough, and the direction of the other half, 1 or −1."""
     rows = frames_of(log)
-    for half, way in ((rows[: len(rows) // 2], 1), (rows[len(rows) // 2 :], -1)):
+    middle = len(rows) // 2
+    for half, way in ((rows[:middle], 1), (rows[middle:], -1)):
         if len(half) >= MIN_FRAMES:
-            yield log._replace(valid=np.isin(np.arange(len(log.time)), half)), way
+            in_half = np.isin(np.arange(len(log.time)), half)
+            yield log._replace(valid=in_half), way
 
 
-def _undone(log: Log, model: RobotModel, others: Others, known: Mapping[str, float]) -> str:
+def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[str, float]) -> str:
     """Name the one or two mistakes without which the log is explained far better, and others that do so as well.
 
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
     """
     rows = frames_of(log, FRAMES)
     noise = np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
-
-    def misfit(each: _Remedy, begin: Mapping[str, float] | None = None) -> float:
-        robot = identify(each.log, each.model, FRAMES, fits=2, begin=begin)
-        if known and begin is None and robot.unlikely():
-            return np.inf
-        error = np.minimum(np.sum((robot.residuals / noise) ** 2, axis=1), OUTLIER * len(noise))
-        return float(error.sum()) + sum(size**2 for size in robot.sizes().values())
-
-    as_it_is = least = misfit(_Remedy("", log, model), known)
-    names = []
-    stages = ((_remedies, TIE),) if known else ((_remedies, GAIN), (_pairs, PAIR_GAIN))
+    explained = MAX_NOISE_RATIO**2 * log.spec.m * len(rows)
+    as_it_is = _misfit(_fit(_Remedy("", log, model), known), noise)
+    stages = [(_remedies, REMEDY_GAIN), (_pairs, PAIR_GAIN)]
+    if known:
+        stages = [(_remedies, TIE_RATIO)]
+    least = as_it_is
+    names: list[str] = []
     for remedies, gain in stages:
-        tried = nsmallest(SCREENED, _placed(remedies(log, model, others), rows))
-        found = sorted((misfit(each), each.text) for *_, each in tried)
-        if found[0][0] < gain * least:
-            least = found[0][0]
-            names = [text for own, text in found if own <= TIE * least]
-        if names and least < UNEXPLAINED**2 * log.spec.m * len(rows):
+        fits = []
+        for *_, remedy in nsmallest(SCREENED, _placed(remedies(log, model, others), rows)):
+            robot = _fit(remedy)
+            refuted = known and robot.unlikely()
+            fits.append((np.inf if refuted else _misfit(robot, noise), remedy.text))
+        fits.sort()
+        best, _ = fits[0]
+        if best < gain * least:
+            least = best
+            names = [text for misfit, text in fits if misfit <= TIE_RATIO * least]
+        if names and least < explained:
             break
     if not names:
         return ""
+    left = math.sqrt(least / max(least, as_it_is))
     which = "; a log cannot tell which" if len(names) > 1 else ""
-    return f"{', or '.join(names)} (undone, {math.sqrt(least / max(least, as_it_is)):.0%} of the error is left{which})"
+    return f"{', or '.join(names)} (undone, {left:.0%} of the error is left{which})"
+
+
+def _fit(remedy: _Remedy, begin: Mapping[str, float] | None = None) -> Identified:
+    """Return the robot behind a remedy, by a few frames."""
+    return identify(remedy.log, remedy.model, FRAMES, fits=2, begin=begin)
+
+
+def _misfit(robot: Identified, noise: FloatArray) -> float:
+    """Return the squared errors of a robot over the noise, (m,), and its squared prior deviations."""
+    distances = np.sum((robot.residuals / noise) ** 2, axis=1)
+    error = np.minimum(distances, OUTLIER * len(noise))
+    return float(error.sum()) + sum(size**2 for size in robot.sizes().values())
 
 
 def _placed(remedies: Iterator[_Remedy], rows: FloatArray) -> Iterator[tuple[float, int, _Remedy]]:
     """Yield the error of some rows of each log before a camera where it fits, a number that counts up, and the log."""
     numbers = count()
-    while part := list(islice(remedies, AT_ONCE)):
+    while part := list(islice(remedies, REMEDIES_AT_ONCE)):
         for _, same in groupby(part, key=lambda each: id(each.model)):
             group = list(same)
             joints = np.stack([each.log.joints[rows] for each in group])

@@ -336,12 +336,12 @@ def lost(log):
 
 MISTAKES = {
     "exchanged": (exchanged, "joints shoulder_lift and elbow are exchanged"),
-    "drifting": (drifting, r"frames come 40 ± \d ms later at the end than at the begin"),
+    "drifting": (drifting, r"frames come 40 ± \d ms later at the end than at the beginning"),
     "early": (
         early,
         r"frames come (69|70) ms before the joints are where they show them, as clocks of camera and joints",
     ),
-    "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
+    "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the beginning"),
     "repeated": (
         repeated,
         r"25% of the frames repeat another one although the arm moves, first in row \d+",
