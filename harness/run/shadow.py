@@ -41,17 +41,20 @@ from servobench.plant.robot.hand_eye import RobotModel
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
 PREDICTED: Final = "predicted_"  # before the name of a column of features
 DELAY: Final = "delay"  # diagnostic of controllers that identify the camera's delay [s]
-MAX_DELAY: Final = 0.25  # [s] up to which another delay is tried
-MIN_GAIN: Final = 0.8  # [1] share of the prediction error that another delay leaves, below which it is remarked on
-MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
-MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
-MIN_MOTION: Final = (
-    0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
-)
-MIN_SECOND: Final = 0.1  # share of the first direction of a motion that the second one needs to tell its sides apart
+MAX_DELAY: Final = 0.25  # [s] longest delay that is tried in place of the controller's
+# Another delay is remarked on if it leaves less than this share of the prediction error.
+MIN_GAIN: Final = 0.8  # [1]
+MAX_EXCESS: Final = 0.1  # [rad] by which a joint may be beyond its range without a remark
+MAX_FEATURE: Final = 20.0  # [m] largest feature that a camera may see, in natural units
+# Noise may be larger than a motion whose RMS distance from the mean is below this.
+MIN_MOTION: Final = 0.02  # [m]
+# A mirrored motion can be told from a turned one if its second direction has this share of the first one's size.
+MIN_SECOND_DIRECTION: Final = 0.1  # [1]
 MAX_LATE: Final = 12  # control periods by which features may be late
-# Share of the motion by which features may differ without a remark
-MAX_SHARE_APART: Final = {"m": 0.2, "px": 0.35}
+# Share of the motion that the model may leave unexplained without a remark, by unit.
+MAX_UNEXPLAINED: Final = {"m": 0.2, "px": 0.35}
+# Pixels have no usual size, so an affine map explains any small motion: the model's must not be larger by this factor.
+MAX_MOTION_RATIO: Final = 8.0  # [1]
 
 
 @final
@@ -72,7 +75,9 @@ class LoggedPlant(Plant):
         Raises:
             ConfigurationError: a column or a number is missing.
         """
-        self.spec, self.log, self._k = spec, read_log(spec, table, least=0), 0
+        self.spec = spec
+        self.log = read_log(spec, table, least=0)
+        self._k = 0
         self.reference = numbers_of(LOG, table, column_names(spec)["reference"])
         if not self.log.valid.any():
             raise ConfigurationError("the log has no row whose feature_valid is 1 or true")
@@ -82,43 +87,59 @@ class LoggedPlant(Plant):
         """Refuse joints and features that no robot of this kind has, and remark on features that move otherwise.
 
         Args:
-            model: of the robot that was logged; None where it is unknown.
+            model: the robot that was logged; None where it is unknown.
 
         Raises:
             ConfigurationError: names the row, and the unit in which the log has to be.
         """
-        spec, (excess, where) = self.spec, self.log.farthest_joint()
-        if mistake := self.log.joint_mistake():
+        mistake = self.log.joint_mistake()
+        if mistake:
             raise ConfigurationError(mistake)
-        for found in filter(
-            None,
-            (where * (excess > MAX_EXCESS), self.log.first_jump()[0], self.log.frame_mistake()),
-        ):
-            remark(found)
-        for kind, values in (("feature", self.log.features), ("reference", self.reference)):
-            sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
-            far, size = int(sizes.argmax()), float(sizes.max())
-            if unit in ("m", "px") and size > MAX_FEATURE * spec.feature.scale:
-                where = f"row {far} of the log has a {kind} of {size:g} {unit}, beyond any camera"
-                raise ConfigurationError(
-                    where + "; if the log is in mm, write it in m" * (unit == "m")
-                )
+        excess, where = self.log.farthest_joint()
+        if excess > MAX_EXCESS:
+            remark(where)
+        jump, _ = self.log.first_jump()
+        if jump:
+            remark(jump)
+        repeated = self.log.frame_mistake()
+        if repeated:
+            remark(repeated)
+        self._check_size("feature", self.log.features)
+        self._check_size("reference", self.reference)
         if model is not None and self.log.valid[MAX_LATE:].any():
             self._check_motion(model)
 
+    def _check_size(self, kind: str, values: FloatArray) -> None:
+        """Refuse features or references (k, m) that are larger than any camera sees."""
+        channel = self.spec.feature
+        unit = channel.unit
+        sizes = np.abs(values).max(axis=1)
+        size = float(sizes.max())
+        if unit not in ("m", "px") or size <= MAX_FEATURE * channel.scale:
+            return
+        row = int(sizes.argmax())
+        found = f"row {row} of the log has a {kind} of {size:g} {unit}, beyond any camera"
+        if unit == "m":
+            found += "; if the log is in mm, write it in m"
+        raise ConfigurationError(found)
+
     def _check_motion(self, model: RobotModel) -> None:
         """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
-        y, p = (
-            each / self.spec.feature.scale
-            for each in (self.log.features, model.feature(self.log.joints))
-        )
-        rows = len(y) - np.arange(min(MAX_LATE, len(y) // 2))
-        valid, unit = self.log.valid, self.spec.feature.unit
-        apart, mirrored = min(_apart(y[-k:][valid[-k:]], p[:k][valid[-k:]], unit) for k in rows)
-        if apart > MAX_SHARE_APART.get(unit, MAX_SHARE_APART["px"]):
-            found = f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}"
+        channel = self.spec.feature
+        valid = self.log.valid
+        features = self.log.features / channel.scale
+        modelled = model.feature(self.log.joints) / channel.scale
+        fits = []
+        for late in range(min(MAX_LATE, len(features) // 2)):
+            # A feature shows the joints of `late` rows before.
+            rows = len(features) - late
+            known = valid[late:]
+            fits.append(_image_fit(features[late:][known], modelled[:rows][known], channel.unit))
+        unexplained, mirrored = min(fits)
+        if unexplained > MAX_UNEXPLAINED.get(channel.unit, MAX_UNEXPLAINED["px"]):
+            found = "features of the log move otherwise than this robot's at these joints"
             causes = "other units, another order or sign of joints, another arm, or a camera that was moved"
-            remark(f"{found}: look for {causes}")
+            remark(f"{found}, by {unexplained:.0%}: look for {causes}")
         elif mirrored:
             remark("features of the log are mirrored: x points right in the image, y down, z ahead")
 
@@ -133,8 +154,10 @@ class LoggedPlant(Plant):
         return self._row()
 
     def _row(self) -> Observation:
-        k, log = self._k, self.log
-        return Observation(k * self.spec.period, log.joints[k], log.features[k], bool(log.valid[k]))
+        k = self._k
+        log = self.log
+        time = k * self.spec.period
+        return Observation(time, log.joints[k], log.features[k], bool(log.valid[k]))
 
     def truth(self) -> Truth:
         """Return the true feature of the log, NaN where it has none."""
@@ -160,38 +183,40 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         ConfigurationError: settings or a log that cannot be used, or the controller failed.
     """
     experiment = build(resolved)
-    spec, request, true = experiment.plant.spec, resolved.request, experiment.drawn.true
+    request = resolved.request
+    spec = experiment.plant.spec
     try:
         plant = LoggedPlant(spec, table)
-        plant.check_units(true)
+        plant.check_units(experiment.drawn.true)
         log = StepLog(spec, len(table))
-        loop = LoopSettings(
-            len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1
-        )
+        never = len(table) + 1
+        loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=never)
         desired = experiment.desired(loop.periods)
         logged = plant.reference
         if not np.array_equal(desired[: len(logged)], logged):
             desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])
         with careful():
-            run_loop(
-                *held_to_contract(plant, experiment.controller), desired, loop, request.seed, log
-            )
+            pair = held_to_contract(plant, experiment.controller)
+            run_loop(*pair, desired, loop, request.seed, log)
     except RunFault as fault:
         row = len(log.steps())
-        raise ConfigurationError(
-            f"controller {request.controller} fails in row {row} of the log: {fault}"
-        ) from fault
+        where = f"controller {request.controller} fails in row {row} of the log"
+        raise ConfigurationError(f"{where}: {fault}") from fault
     finally:
         experiment.plant.close()
     rows = log.steps()
     steps = rows.table(request.run_id)
-    if not np.isnan(ahead := predicted(rows)).all():
-        steps[[PREDICTED + name for name in column_names(spec)["feature"]]] = ahead
+    ahead = predicted(rows)
+    if not np.isnan(ahead).all():
+        features = column_names(spec)["feature"]
+        steps[[PREDICTED + name for name in features]] = ahead
         _check_delay(rows, ahead)
-    if (commands := plant.log.commands) is not None:
+    commands = plant.log.commands
+    if commands is not None:
         steps[[LOGGED + name for name in column_names(spec)[COMMAND]]] = commands
-        if wrong := command_mistake(plant.log):
-            remark(wrong)
+        mistake = command_mistake(plant.log)
+        if mistake:
+            remark(mistake)
     return steps
 
 
@@ -199,24 +224,28 @@ def predicted(steps: Steps, delay: float | None = None) -> FloatArray:
     """Return the feature that the Jacobian of the valid frame before predicts for each valid frame, as above.
 
     Args:
-        steps: of one run.
+        steps: rows of one run.
         delay: d [s] at all frames; by default that of the controller.
 
     Returns:
         (k, m) [unit of the feature]; NaN where no valid frame is at most `MAX_LATE` periods before, where the
         controller had no Jacobian, and where the joint motion began before the log.
     """
-    y, t = np.full_like(steps.feature, np.nan), steps.time
-    late = (
-        steps.diagnostics.get(DELAY, np.zeros_like(t)) if delay is None else np.full_like(t, delay)
-    )
+    t = steps.time
+    d = steps.diagnostics.get(DELAY, np.zeros_like(t))
+    if delay is not None:
+        d = np.full_like(t, delay)
     frames = np.flatnonzero(steps.feature_valid)
-    begin, end = frames[:-1], frames[1:]
-    known = (end - begin <= MAX_LATE) & (t[begin] - late[begin] >= t[0])
-    begin, end = begin[known], end[known]
-    before, after = t[begin] - late[begin], t[end] - late[begin]
+    begins = frames[:-1]
+    ends = frames[1:]
+    known = (ends - begins <= MAX_LATE) & (t[begins] - d[begins] >= t[0])
+    k = begins[known]
+    next_k = ends[known]
+    before = t[k] - d[k]
+    after = t[next_k] - d[k]
     moved = [np.interp(after, t, q) - np.interp(before, t, q) for q in steps.joint_position.T]
-    y[end] = steps.feature[begin] + np.matvec(steps.estimated_jacobian[begin], np.transpose(moved))
+    y = np.full_like(steps.feature, np.nan)
+    y[next_k] = steps.feature[k] + np.matvec(steps.estimated_jacobian[k], np.transpose(moved))
     return y
 
 
@@ -227,7 +256,8 @@ def _check_delay(steps: Steps, ahead: FloatArray) -> None:
     common = np.isfinite(tried).all(axis=(0, 2))
     if not common.any():
         return
-    own, *others = (_rms(each) for each in (steps.feature - tried)[:, common])
+    errors = (steps.feature - tried)[:, common]
+    own, *others = map(_rms, errors)
     best = int(np.argmin(others))
     if others[best] < MIN_GAIN * own:
         late = f"features of the log come {delays[best]:g} s after the joint motion"
@@ -240,20 +270,31 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
-def _apart(y: FloatArray, p: FloatArray, unit: str) -> tuple[float, bool]:
-    """Return the share of the motion of features (k, m) that no image of p explains, or 0, and if y is mirrored."""
-    y, p = y - y.mean(axis=0), p - p.mean(axis=0)
-    seen, made = _rms(y), _rms(p)
-    if max(seen, made) < MIN_MOTION:
+def _image_fit(y: FloatArray, p: FloatArray, unit: str) -> tuple[float, bool]:
+    """Return the share of the motion of features (k, m) that no image of p explains, or 0, and if y is mirrored.
+
+    The image of places is a rotation, and that of pixels an affine map.
+    """
+    y = y - y.mean(axis=0)
+    p = p - p.mean(axis=0)
+    motion = _rms(y)
+    motion_of_model = _rms(p)
+    if max(motion, motion_of_model) < MIN_MOTION:
         return 0.0, False
-    image = nearest_rotation(y.T @ p).T if unit == "m" else np.linalg.lstsq(p, y, rcond=None)[0]
-    if unit != "m" and 8.0 * seen < made:
-        return 1.0, False
-    rest, sizes = _rms(y - p @ image), np.linalg.svd(y.T @ p, compute_uv=False)
-    sided = len(sizes) in (2, 3) and sizes[1] > MIN_SECOND * sizes[0]
-    return rest / (max(seen, made) if unit == "m" else seen), bool(
-        sided and np.linalg.det(image[:2, :2]) < 0.0
-    )
+    if unit == "m":
+        image = nearest_rotation(y.T @ p).T
+        whole = max(motion, motion_of_model)
+    else:
+        if MAX_MOTION_RATIO * motion < motion_of_model:
+            return 1.0, False
+        affine, *_ = np.linalg.lstsq(p, y, rcond=None)
+        image = np.asarray(affine, dtype=np.float64)
+        whole = motion
+    rest = _rms(y - p @ image)
+    sizes = np.linalg.svd(y.T @ p, compute_uv=False)
+    has_sides = len(sizes) in (2, 3) and sizes[1] > MIN_SECOND_DIRECTION * sizes[0]
+    mirrored = has_sides and np.linalg.det(image[:2, :2]) < 0.0
+    return rest / whole, bool(mirrored)
 
 
 def differences(steps: pd.DataFrame) -> pd.DataFrame:
@@ -267,11 +308,16 @@ def differences(steps: pd.DataFrame) -> pd.DataFrame:
     if not logged:
         return pd.DataFrame()
     names = [name.removeprefix(LOGGED) for name in logged]
-    was, apart = steps[logged].to_numpy(), steps[names].to_numpy() - steps[logged].to_numpy()
-    rms = (np.sqrt(np.mean(each**2, axis=0)) for each in (was, apart))
-    joints = [name.removeprefix(f"{COMMAND}_") for name in names]
-    columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")
-    return pd.DataFrame(dict(zip(columns, (joints, *rms, np.abs(apart).max(axis=0)), strict=True)))
+    u_logged = steps[logged].to_numpy()
+    difference = steps[names].to_numpy() - u_logged
+    return pd.DataFrame(
+        {
+            "command": [name.removeprefix(f"{COMMAND}_") for name in names],
+            "logged, RMS": np.sqrt(np.mean(u_logged**2, axis=0)),
+            "difference, RMS": np.sqrt(np.mean(difference**2, axis=0)),
+            "difference, largest": np.abs(difference).max(axis=0),
+        }
+    )
 
 
 def predictions(steps: pd.DataFrame) -> pd.DataFrame:
@@ -286,12 +332,24 @@ def predictions(steps: pd.DataFrame) -> pd.DataFrame:
     if not names:
         return pd.DataFrame()
     features = [name.removeprefix(PREDICTED) for name in names]
-    y, ahead = steps[features], steps[names].set_axis(features, axis=1)
+    y = steps[features]
+    ahead = steps[names].set_axis(features, axis=1)
     known = ahead.notna().all(axis=1)
     before = y.where(steps["feature_valid"]).ffill().shift()
-    squares = [((y - each)[known] ** 2).mean() for each in (before, ahead)]
-    motion, error = (np.sqrt([*each, each.sum()]) for each in squares)
-    titles = [*(name.removeprefix("feature_") for name in features), "all"]
-    columns = ("feature", "motion, RMS", "prediction error, RMS", "error / motion")
+    motion = _rms_of_columns((y - before)[known])
+    error = _rms_of_columns((y - ahead)[known])
     ratio = np.divide(error, motion, out=np.full_like(error, np.nan), where=motion > 0.0)
-    return pd.DataFrame(dict(zip(columns, (titles, motion, error, ratio), strict=True)))
+    return pd.DataFrame(
+        {
+            "feature": [*(name.removeprefix("feature_") for name in features), "all"],
+            "motion, RMS": motion,
+            "prediction error, RMS": error,
+            "error / motion": ratio,
+        }
+    )
+
+
+def _rms_of_columns(values: pd.DataFrame) -> FloatArray:
+    """Return the RMS of each column, and the root of the sum of their mean squares."""
+    squares = (values**2).mean()
+    return np.sqrt([*squares, squares.sum()])
