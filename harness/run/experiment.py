@@ -9,9 +9,9 @@ import contextlib
 import copy
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -53,11 +53,15 @@ from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.robot import Robot
 
-ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be under any mismatch
-MAX_PLACE: Final = 20.0  # [m] of a usual target
-# Unit -> usual norms of a Jacobian, in it per rad
+REACH_MARGIN: Final = (
+    0.1  # [m] by which a target may be out of the nominal reach under any mismatch
+)
+MAX_PLACE: Final = 20.0  # [m] farthest target that is not remarked on
+# Usual norms of a Jacobian by unit of the feature, in this unit per rad.
 RATES: Final = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}
-POINTS: Final = 12  # of a curve that are checked
+POINTS: Final = 12  # points of a curve that are checked
+# Noise, steps and outliers are remarked on beyond this share of an image, or of a metre.
+MAX_EXTENT: Final = 0.1  # [1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +69,12 @@ class Drawn:
     """The values drawn for one run."""
 
     scenario: Scenario
-    true: RobotModel | None = (
-        None  # the true robot and its cameras; None for a plant that brings its own
-    )
+    # The true robot and its cameras; None for a plant that brings its own.
+    true: RobotModel | None = None
     sample: MismatchSample | None = None  # how it differs from the nominal one
     moved: RobotModel | None = None  # the true robot after its camera was moved; None if it is not
-    cameras: CameraDraws | None = (
-        None  # how cameras differ from those planned; None where they are part of `sample`
-    )
+    # How cameras differ from those planned; None where they are part of `sample`.
+    cameras: CameraDraws | None = None
 
     @property
     def final(self) -> RobotModel | None:
@@ -81,13 +83,11 @@ class Drawn:
 
     def as_record(self) -> dict[str, object]:
         """Return all values drawn for robot and cameras, for JSON."""
-        parts = (self.sample, self.cameras)
-        return {
-            name: value
-            for part in parts
-            if part is not None
-            for name, value in part.as_record().items()
-        }
+        record: dict[str, object] = {}
+        for part in (self.sample, self.cameras):
+            if part is not None:
+                record |= part.as_record()
+        return record
 
 
 def draw(resolved: ResolvedRun) -> Drawn:
@@ -96,11 +96,18 @@ def draw(resolved: ResolvedRun) -> Drawn:
     Raises:
         ConfigurationError: a mismatch or a task that cannot be used.
     """
-    request, robot = resolved.request, find_robot(resolved.request.robot)
+    request = resolved.request
+    robot = find_robot(request.robot)
     true, sample, cameras = draw_robot(request)
-    moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
+    moved = sample.moved(true, robot)
     setting = TaskSetting(
-        true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal
+        true,
+        true.arm.n,
+        true.channel,
+        named_seed(request.seed, "task"),
+        moved,
+        robot,
+        nominal=find_sensing(request.sensing).nominal(robot),
     )
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
 
@@ -112,7 +119,8 @@ def draw_robot(request: RunRequest) -> tuple[RobotModel, MismatchSample, CameraD
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
-    robot, seed = find_robot(request.robot), named_seed(request.seed, "mismatch")
+    robot = find_robot(request.robot)
+    seed = named_seed(request.seed, "mismatch")
     arm, sample = sample_mismatch(request.mismatch, robot, seed)
     sensing = find_sensing(request.sensing)
     true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
@@ -128,7 +136,8 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
     Raises:
         ConfigurationError: a task that cannot be used there, or times that do not fit.
     """
-    name, task = resolved.request.task, resolved.task
+    name = resolved.request.task
+    task = resolved.task
     if setting.model is None and not task.any_robot:
         others = ", ".join(name for name, entry in TASKS.items() if entry.default.any_robot)
         why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
@@ -140,32 +149,44 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
             raise ConfigurationError(
                 f"its method scenario must return a servobench.Scenario, got {scenario!r}"
             )
-        m, times = len(setting.feature.names), np.linspace(0.0, scenario.duration, POINTS)
-        points = np.asarray(scenario.reference.at(times))
-        if points.shape != (POINTS, m) or not np.isfinite(points).all():
-            got = f"shape {points.shape} and {points[:1].tolist()}"
-            raise ConfigurationError(
-                f"its reference must be {m} finite features at {POINTS} instants, got {got}"
-            )
+        points = _points_of(scenario, len(setting.feature.names))
         last = (resolved.run.periods(scenario.duration) - 1) * resolved.run.period
-        if (
-            scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9
-        ):  # a move is judged by its settling
-            part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
+        # A move is judged by its settling, whenever its judged part begins.
+        if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:
+            begins = f"begins at {scenario.evaluate_from:g} s"
+            part = f"{begins}, after the last control instant at {last:g} s"
             raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
         if name not in TASKS:
             with configuration_errors(
                 "its scenario differs from one call to the next: ", Exception
             ):
-                again: Any = task.scenario(setting)
-                starts: list[Any] = [scenario.start, again.start]
-                if not (
-                    np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)
-                ):
-                    raise ConfigurationError("draw from setting.seed alone")
+                _check_repeated(scenario, points, task.scenario(setting))
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
+
+
+def _points_of(scenario: Scenario, m: int) -> FloatArray:
+    """Return the reference of a scenario at a few instants, (p, m), and refuse one of another shape."""
+    points = np.asarray(scenario.reference.at(_instants(scenario)))
+    if points.shape != (POINTS, m) or not np.isfinite(points).all():
+        got = f"shape {points.shape} and {points[:1].tolist()}"
+        raise ConfigurationError(
+            f"its reference must be {m} finite features at {POINTS} instants, got {got}"
+        )
+    return points
+
+
+def _instants(scenario: Scenario) -> FloatArray:
+    return np.linspace(0.0, scenario.duration, POINTS)
+
+
+def _check_repeated(scenario: Scenario, points: FloatArray, again: Scenario) -> None:
+    """Refuse a task whose second scenario is another one, given points of the first."""
+    repeated = np.array_equal(points, again.reference.at(_instants(scenario)))
+    starts: list[Any] = [scenario.start, again.start]
+    if not repeated or not np.array_equal(*starts):
+        raise ConfigurationError("draw from setting.seed alone")
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +197,7 @@ class Experiment:
     controller: Controller  # likewise
     runs: tuple[Drawn, ...]  # the true robot and the task of each run
     run: RunSettings  # the settings that all of them share
-    networks: Sequence[TrainedNetworks] = ()  # that the controller started from, if any
+    networks: Sequence[TrainedNetworks] = ()  # networks that the controller started from, if any
     together: bool = False  # whether there are lanes, also for a single run
 
     @property
@@ -197,23 +218,24 @@ class Experiment:
     @property
     def loop(self) -> LoopSettings:
         """The settings of the loop, with the camera's pose (..., 4, 4) after a move."""
-        run, periods = self.run, self.periods
+        run = self.run
         moved = [each.moved.camera for each in self.runs if each.moved is not None]
-        move = (
-            CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
-        )
-        return LoopSettings(periods, run.preview_rows, run.periods(run.lost_after), move)
+        move = None
+        if moved:
+            instant = int(run.camera_moves_at * self.periods)
+            move = CameraMove(instant, self._in_lanes(moved))
+        return LoopSettings(self.periods, run.preview_rows, run.periods(run.lost_after), move)
 
     def desired(self, periods: int | None = None) -> FloatArray:
-        """Return the desired features of the run, or of so many periods, and beyond them those that are previewed.
+        """Return the desired features of the run, or of this number of periods, and of the previewed rows beyond.
 
         Returns:
             (..., periods + preview, m) [unit of the feature].
         """
-        rows = (self.periods if periods is None else periods) + self.run.preview_rows
-        return self._in_lanes(
-            [each.scenario.reference.sampled(self.plant.spec.period, rows) for each in self.runs]
-        )
+        count = self.periods if periods is None else periods
+        rows = count + self.run.preview_rows
+        period = self.plant.spec.period
+        return self._in_lanes([each.scenario.reference.sampled(period, rows) for each in self.runs])
 
     def _in_lanes(self, arrays: list[FloatArray]) -> FloatArray:
         return np.stack(arrays) if self.together else arrays[0]
@@ -233,9 +255,8 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
     request = resolved.request
     if not find_plant(request.plant).own_robot:
         drawn = draw(resolved)
-        plant, controller, networks = _assemble(
-            resolved, drawn.true, drawn.scenario.start, progress
-        )
+        start = drawn.scenario.start
+        plant, controller, networks = _assemble(resolved, drawn.true, start, progress)
         return Experiment(plant, controller, (drawn,), resolved.run, networks)
     brings = f"plant {request.plant} brings a"
     if request.mismatch != Mismatch():
@@ -248,15 +269,13 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
         )
     plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
-        setting = TaskSetting(
-            None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task")
-        )
-        return Experiment(
-            plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run, networks
-        )
+        seed = named_seed(request.seed, "task")
+        setting = TaskSetting(None, plant.spec.n, plant.spec.feature, seed)
+        drawn = Drawn(build_scenario(resolved, setting))
     except BaseException:
         plant.close()
         raise
+    return Experiment(plant, controller, (drawn,), resolved.run, networks)
 
 
 @same_folder()
@@ -266,11 +285,10 @@ def build_together(runs: Sequence[ResolvedRun]) -> Experiment:
     Raises:
         Exception: any error of a run alone, or runs that cannot advance together.
     """
-    first, drawn = runs[0], tuple(map(draw, runs))
-    robots, starts = (
-        stack([each.true for each in drawn]),
-        np.array([each.scenario.start for each in drawn]),
-    )
+    first = runs[0]
+    drawn = tuple(map(draw, runs))
+    robots = stack([each.true for each in drawn])
+    starts = np.array([each.scenario.start for each in drawn])
     plant, controller, networks = _assemble(first, robots, starts)
     return Experiment(plant, controller, drawn, first.run, networks, together=True)
 
@@ -286,7 +304,9 @@ def _assemble(
     For None the plant brings its own. Of runs side by side the arrays of the robot have a leading axis, and `resolved`
     is one of them.
     """
-    request, run, entry = resolved.request, resolved.run, find_plant(resolved.request.plant)
+    request = resolved.request
+    run = resolved.run
+    entry = find_plant(request.plant)
     if request.sensing != DEFAULT_SENSING and not entry.any_sensing:
         raise ConfigurationError(
             f"plant {entry.name} has the sensing position only, got {request.sensing}"
@@ -297,9 +317,8 @@ def _assemble(
         plant = entry.build(resolved.plant, setup)
     if not math.isclose(plant.spec.period, run.period):
         plant.close()
-        raise ConfigurationError(
-            f"plant {request.plant}: spec.period must be that of its setup, {run.period:g} s"
-        )
+        wanted = f"spec.period must be that of its setup, {run.period:g} s"
+        raise ConfigurationError(f"plant {request.plant}: {wanted}")
     try:
         if true is not None and request.mismatch.size("camera_move") > 0.0:
             # Refused where it cannot be moved; a user's camera may lack something before its reset.
@@ -308,17 +327,9 @@ def _assemble(
                 configuration_errors(f"plant {request.plant}: "),
             ):
                 plant.move_camera(true.camera)
-        if robot is None:
-            trained = knowledge = RobotKnowledge(
-                plant.spec, run.preview_rows, plant.nominal_jacobian()
-            )
-        else:
-            nominal = find_sensing(request.sensing).nominal(robot)
-            knowledge, trained = nominal_knowledge(robot, nominal, plant.spec, run)
+        knowledge, trained = _knowledge(resolved, plant, robot)
         source = network_source(trained, progress)
-        true_model = (
-            plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
-        )
+        true_model = partial(_true_model, plant, true)
         with naming_the_lack(plant, own_robot=robot is None):
             controller = _build_controller(resolved, replace(knowledge, train=source), true_model)
     except BaseException:
@@ -327,17 +338,26 @@ def _assemble(
     return plant, controller, () if source is None else source.given
 
 
+def _knowledge(
+    resolved: ResolvedRun, plant: Plant, robot: Robot | None
+) -> tuple[RobotKnowledge, RobotKnowledge]:
+    """Return the knowledge of a controller, and that for training networks; None for a plant's own robot."""
+    run = resolved.run
+    if robot is None:
+        own = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
+        return own, own
+    nominal = find_sensing(resolved.request.sensing).nominal(robot)
+    return nominal_knowledge(robot, nominal, plant.spec, run)
+
+
 @contextlib.contextmanager
 def naming_the_lack(plant: Plant, *, own_robot: bool) -> Iterator[None]:
     """Add to an error of a controller that calls the nominal model where there is none that this is so."""
     try:
         yield
     except (AttributeError, ConfigurationError, TypeError) as error:
-        if (
-            own_robot
-            and plant.nominal_jacobian() is None
-            and re.search("NoneType|callable", str(error))
-        ):
+        calls_none = re.search("NoneType|callable", str(error))
+        if own_robot and plant.nominal_jacobian() is None and calls_none:
             lack = "knowledge.nominal_jacobian is None here: this plant has no model"
             if isinstance(error, ConfigurationError):
                 raise ConfigurationError(f"{error}; {lack}") from error
@@ -359,7 +379,7 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     except BaseException as error:
         if isinstance(error, ConfigurationError) or ends_batch(error):
             raise
-        return  # of a plug-in; its run will fail in the same way
+        return  # The error is one of a plug-in; its run will fail in the same way.
     check_possible(run, experiment)
 
 
@@ -369,48 +389,58 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     Raises:
         ConfigurationError: names it and the joint, or how far it is out of reach of any true robot.
     """
-    scenario, spec = experiment.scenario, experiment.plant.spec
     if experiment.drawn.true is None:
         return
+    scenario = experiment.scenario
+    spec = experiment.plant.spec
     for what, values in (("start", scenario.start), ("target", run.task.taught_at)):
-        if values is None:
-            continue
-        limited = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
-        for joint, value, lower, upper in limited:
-            if not lower <= value <= upper:
-                wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
-                raise ConfigurationError(
-                    f"task {run.request.task}: {what} must be {wanted}, got {value:g}"
-                )
+        if values is not None:
+            _check_limits(f"task {run.request.task}: {what}", values, spec)
     _check_reach(run, scenario, spec)
+
+
+def _check_limits(what: str, values: Iterable[float], spec: PlantSpec) -> None:
+    """Refuse joint positions (n,) rad outside the limits; `what` they are begins the message."""
+    limited = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
+    for joint, value, lower, upper in limited:
+        if not lower <= value <= upper:
+            wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
+            raise ConfigurationError(f"{what} must be {wanted}, got {value:g}")
 
 
 def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
     """Remark on a reference that is likely in mm or too fast for the arm, and on a user's features that hardly move."""
-    spec, true, start = experiment.plant.spec, experiment.drawn.true, experiment.scenario.start
-    task, unit = f"the reference of the task {run.request.task}", spec.feature_unit
-    with configuration_errors(f"task {run.request.task}: "):
+    request = run.request
+    spec = experiment.plant.spec
+    unit = spec.feature_unit
+    true = experiment.drawn.true
+    start = experiment.scenario.start
+    task = f"the reference of the task {request.task}"
+    with configuration_errors(f"task {request.task}: "):
         desired = experiment.desired()
     if true is None or start is None:
-        if unit == "m" and (size := np.abs(desired).max()) > MAX_PLACE:
+        size = np.abs(desired).max()
+        if unit == "m" and size > MAX_PLACE:
             remark(f"{task} reaches {size:g} m; if places are meant in mm, write the unit, too")
         return
-    speed = np.linalg.norm(np.diff(desired, axis=0), axis=1).max(initial=0.0) / spec.period
+    distances = np.linalg.norm(np.diff(desired, axis=0), axis=1)
+    speed = distances.max(initial=0.0) / spec.period
     J = true.jacobian(start)
-    if speed > (most := float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)):
-        remark(
-            f"{task} moves at {speed:.3g} {unit}/s, and the arm at {most:.3g} {unit}/s at most from its start"
-        )
-    own = sensing_file(run.request.sensing) is not None
-    if own and len(np.unique([*J.round(9), np.zeros(spec.n)], axis=0)) <= spec.m:
-        remark(
-            f"sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start"
-        )
-    size, (least, most) = float(np.linalg.norm(J)), RATES.get(unit, (0.0, np.inf))
-    if own and not least <= size <= most:
-        remark(
-            f"sensing {run.request.sensing}: features move by {size:.2g} {unit}/rad; is {unit} their unit?"
-        )
+    fastest = float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)
+    if speed > fastest:
+        arm = f"the arm at {fastest:.3g} {unit}/s at most from its start"
+        remark(f"{task} moves at {speed:.3g} {unit}/s, and {arm}")
+    if sensing_file(request.sensing) is None:
+        return
+    sensing = f"sensing {request.sensing}"
+    # Rows of J that are equal, or zeros, are counted once.
+    different = np.unique([*J.round(9), np.zeros(spec.n)], axis=0)
+    if len(different) <= spec.m:
+        remark(f"{sensing}: a feature stands still, or moves as another one does, at the start")
+    rate = float(np.linalg.norm(J))
+    least, most = RATES.get(unit, (0.0, np.inf))
+    if not least <= rate <= most:
+        remark(f"{sensing}: features move by {rate:.2g} {unit}/rad; is {unit} their unit?")
 
 
 def train_networks(
@@ -430,22 +460,29 @@ def train_networks(
         raise ConfigurationError(
             f"networks are trained on a nominal model, and controllers know none of {robot.title}"
         )
+    # Networks do not depend on plant and task.
     request = RunRequest(
         "kinematic", controller, "target", Mismatch(), 0, robot=robot_name, sensing=sensing
     )
-    resolved = resolve(request, settings)  # networks do not depend on plant and task
-    for section, key, text in (
-        settings.assigned if isinstance(resolved.controller, TrainedMethodConfig) else ()
-    ):
-        if (section, key.partition(".")[0]) != (controller, "training"):
-            raise ConfigurationError(
-                f"--set {text} has no effect: networks depend on {controller}.training alone"
-            )
+    resolved = resolve(request, settings)
+    if isinstance(resolved.controller, TrainedMethodConfig):
+        for section, key, text in settings.assigned:
+            topic, _, _ = key.partition(".")
+            if (section, topic) != (controller, "training"):
+                depends = f"networks depend on {controller}.training alone"
+                raise ConfigurationError(f"--set {text} has no effect: {depends}")
     experiment = build(resolved, progress=progress)
     experiment.plant.close()
     if not experiment.networks:
         raise ConfigurationError(f"controller {controller} has no networks to train")
     return experiment.networks[-1]
+
+
+def _true_model(plant: Plant, true: RobotModel | None) -> TrueModel:
+    """Return the model of a true robot with the delays of its plant; for None that of the plant's own robot."""
+    if true is None:
+        return plant.true_model()
+    return plant.with_delays(_equations(true))
 
 
 def _equations(model: RobotModel) -> TrueModel:
@@ -465,39 +502,37 @@ def _build_controller(
     with configuration_errors(f"controller {run.request.controller}: "):
         if entry.needs_truth:
             true = true_model()
+            delays = Delays(true.latency, true.command_delay, true.lag or 0.0, true.latency_spread)
             knowledge = replace(
                 knowledge,
                 nominal_jacobian=knowledge.nominal_jacobian or true.jacobian,
                 true_jacobian=true.jacobian,
                 true_symbolic=true.symbolic,
-                true_delays=Delays(
-                    true.latency, true.command_delay, true.lag or 0.0, true.latency_spread
-                ),
+                true_delays=delays,
                 true_camera_turn=true.camera_turn,
                 true_tool=true.tool,
             )
-        frozen = getattr(type(run.controller), "__dataclass_params__", None)
-        mine = (
-            run.controller
-            if frozen is not None and frozen.frozen
-            else copy.deepcopy(run.controller)
-        )
-        # Runs share the settings, which a class of a user's may change
-        return entry.build(mine, knowledge)
+        # Runs share the settings, which a class of a user's may change.
+        config = run.controller
+        parameters = getattr(type(config), "__dataclass_params__", None)
+        if parameters is None or not parameters.frozen:
+            config = copy.deepcopy(config)
+        return entry.build(config, knowledge)
 
 
 def _check_times(resolved: ResolvedRun, duration: float) -> None:
     """Refuse times that are longer than the run of `duration` [s], so that they never end in it."""
-    plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
+    plant = resolved.request.plant
     whole = f"the run of {duration:g} s"
     times = {"run.period": resolved.run.period}
-    times |= {
-        f"{plant}.{name}": getattr(resolved.plant, name, 0.0) for name in ("command_delay", "lag")
-    }
+    for name in ("command_delay", "lag"):
+        times[f"{plant}.{name}"] = getattr(resolved.plant, name, 0.0)
+    sensing = getattr(resolved.plant, "sensing", None)
     if isinstance(sensing, SensingConfig):
-        names = ("latency", "jitter", "frame_period", "latency_swing")
-        times |= {f"{plant}.sensing.{name}": getattr(sensing, name) for name in names}
-        if late := [begin for begin, _ in sensing.occlusion_windows if begin >= duration]:
+        for name in ("latency", "jitter", "frame_period", "latency_swing"):
+            times[f"{plant}.sensing.{name}"] = getattr(sensing, name)
+        late = [begin for begin, _ in sensing.occlusion_windows if begin >= duration]
+        if late:
             where = f"{plant}.sensing.occlusion_windows"
             raise ConfigurationError(f"{where} must begin within {whole}, got {late[0]:g} s")
     for name, time in times.items():
@@ -519,52 +554,55 @@ def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
     sensing = getattr(resolved.plant, "sensing", None)
     if nominal is None or not isinstance(sensing, SensingConfig):
         return
-    unit, scale = nominal.channel.unit, nominal.noise_unit
-    whole = nominal.optics.size[0] if isinstance(nominal, SetupModel) and unit == "px" else 1.0
+    unit = nominal.channel.unit
+    whole = 1.0
+    if unit == "px" and isinstance(nominal, SetupModel):
+        whole = nominal.optics.size[0]
     with configuration_errors(f"{resolved.request.plant}."):
-        extents = sensing.extents(unit, scale)
+        extents = sensing.extents(unit, nominal.noise_unit)
+    if unit not in ("px", "m"):
+        return
     for name, metres in extents._asdict().items():
-        given, size, place = (
-            getattr(sensing, name),
-            scale * metres,
-            f"{resolved.request.plant}.sensing.{name}",
-        )
-        if unit not in ("px", "m") or size <= (1.0 if name == "outlier_size" else 0.1) * whole:
+        size = nominal.noise_unit * metres
+        if size <= (whole if name == "outlier_size" else MAX_EXTENT * whole):
             continue
-        plain = given == metres
+        place = f"{resolved.request.plant}.sensing.{name}"
         words = f"{place} is {size:.4g} {unit}, above a tenth of {whole:g} {unit}"
+        given = getattr(sensing, name)
+        plain = given == metres
         if plain and unit == "px":
             raise ConfigurationError(
                 f"{words}: a plain number is in metres; for pixels write {given:g}px"
             )
-        if size > whole:
-            raise ConfigurationError(
-                words + likely_meant(metres, "m", lambda other: other <= 0.1 * whole) * plain
-            )
-        remark(words)
+        if size <= whole:
+            remark(words)
+            continue
+        meant = ""
+        if plain:
+            meant = likely_meant(metres, "m", lambda other: other <= MAX_EXTENT * whole)
+        raise ConfigurationError(words + meant)
 
 
 def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:
     """Refuse a target or a curve that no true robot of the run's mismatch can reach, by its farthest point."""
-    task, robot = resolved.request.task, find_robot(resolved.request.robot)
-    taught = not resolved.task.any_robot  # on the true robot
-    if (
-        find_task(task).out_of_reach or taught or resolved.request.sensing != DEFAULT_SENSING
-    ):  # not all are positions
+    task = resolved.request.task
+    taught_on_true_robot = not resolved.task.any_robot
+    only_positions = resolved.request.sensing == DEFAULT_SENSING
+    if find_task(task).out_of_reach or taught_on_true_robot or not only_positions:
         return
-    nominal, times = robot.nominal, np.linspace(0.0, scenario.duration, POINTS)
-    points = np.unique(scenario.reference.at(times), axis=0)
+    robot = find_robot(resolved.request.robot)
+    nominal = robot.nominal
+    points = np.unique(scenario.reference.at(_instants(scenario)), axis=0)
+    in_base = nominal.to_base(points)
     limits = tuple(spec.joint_lower), tuple(spec.joint_upper)
     distances = np.array(_distances(nominal, tuple(map(tuple, points)), *limits))
-    beyond = distances - _room(resolved.request.mismatch, robot, nominal.to_base(points))
+    beyond = distances - _room(resolved.request.mismatch, robot, in_base)
+    from_shoulder = np.linalg.norm(in_base - robot.workspace.shoulder, axis=-1)
+    nearest = float(from_shoulder.min())
+    if nearest < 0.5 * robot.workspace.reach[0]:
+        place = f"{1e3 * nearest:.0f} mm from the arm's shoulder"
+        remark(f"task {task}: a target {place} is within the arm itself")
     worst = int(beyond.argmax())
-    centre = float(
-        np.linalg.norm(nominal.to_base(points) - robot.workspace.shoulder, axis=-1).min()
-    )
-    if centre < 0.5 * robot.workspace.reach[0]:
-        remark(
-            f"task {task}: a target {1e3 * centre:.0f} mm from the arm's shoulder is within the arm itself"
-        )
     if beyond[worst] > 0.0:
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
         on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]
@@ -579,9 +617,8 @@ def _distances(
     nominal: HandEyeModel, points: tuple[Vector, ...], lower: Vector, upper: Vector
 ) -> Vector:
     """Return how near the nominal arm comes to each point [m]."""
-    found = closest_distance(
-        nominal.arm, nominal.to_base(np.array(points)), np.array(lower), np.array(upper)
-    )
+    places = nominal.to_base(np.array(points))
+    found = closest_distance(nominal.arm, places, np.array(lower), np.array(upper))
     return tuple(found.tolist())
 
 
@@ -591,14 +628,13 @@ def _room(mismatch: Mismatch, robot: Robot, points: FloatArray) -> FloatArray:
     Longer links and tools reach farther; a turned camera turns the point about the middle of the workspace.
     """
     length = float(np.linalg.norm(robot.arm.translation, axis=-1).sum())
-    arm = ROOM + length * mismatch.size("links") + math.sqrt(3.0) * mismatch.size("tool")
+    longer_links = length * mismatch.size("links")
+    longer_tool = math.sqrt(3.0) * mismatch.size("tool")
+    longer = REACH_MARGIN + longer_links + longer_tool
     turn = min(math.pi, mismatch.size("camera_rotation") + mismatch.size("camera_move"))
-    turned = (
-        2.0
-        * math.sin(turn / 2.0)
-        * np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
-    )
-    return np.asarray(arm + turned)
+    chord = 2.0 * math.sin(turn / 2.0)  # of a circle of radius 1
+    radius = np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
+    return np.asarray(longer + chord * radius)
 
 
 def try_to_build(word: str, name: str, robot_name: str) -> None:
@@ -615,13 +651,15 @@ def try_to_build(word: str, name: str, robot_name: str) -> None:
         with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
             build(resolve(request, Settings()), progress=_stop).plant.close()
         return
-    entry, period = find_plant(name), RunSettings().period
-    setup = PlantSetup(None, None, period) if entry.own_robot else None
-    setup = setup or PlantSetup(robot.nominal, robot.workspace.home, period, robot)
+    entry = find_plant(name)
+    period = RunSettings().period
+    if entry.own_robot:
+        setup = PlantSetup(None, None, period)
+    else:
+        setup = PlantSetup(robot.nominal, robot.workspace.home, period, robot)
     with configuration_errors(f"plant {name}: "), contextlib.suppress(RunFault):
-        plant = entry.build(
-            entry.config() if entry.config_for is None else entry.config_for(robot), setup
-        )
+        config = entry.config() if entry.config_for is None else entry.config_for(robot)
+        plant = entry.build(config, setup)
         with contextlib.suppress(Exception):  # `servobench check plant` reports it
             plant.close()
 
