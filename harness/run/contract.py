@@ -27,8 +27,8 @@ from servobench.plant.contract.signals import (
 )
 
 PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
-# of diagnostics in a run, each of which is a column, and of one of their names
-MAX_NAMES, MAX_LETTERS = (256, 100)
+MAX_NAMES = 256  # names of diagnostics in a run, each of which is a column
+MAX_LETTERS = 100  # letters of such a name
 
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
@@ -49,7 +49,8 @@ class HeldController(Controller):
         """Take a controller and the spec of its plant; with aids it is the user's controller that is checked, too."""
         if isinstance(controller, AidedController):
             controller.law.own = HeldController(controller.law.own, spec)
-        self._controller, self._spec = controller, spec
+        self._controller = controller
+        self._spec = spec
         self._names: set[str] = set()
 
     def reset(self, observation: Observation, seed: int) -> None:
@@ -63,7 +64,8 @@ class HeldController(Controller):
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`."""
-        method, n = self._controller.step, self._spec.n
+        method = self._controller.step
+        n = self._spec.n
         given = _copied(observation), _frozen(reference)
         command = _call(method, "step(self, observation, reference)", *given)
         if _bytes(*given) != _bytes(observation, reference):
@@ -71,7 +73,8 @@ class HeldController(Controller):
         if not isinstance(command, Command):
             text = f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)`"
             raise WrongAnswer(f"{text} with {n} joint velocities in rad/s", method)
-        if (shape := command.joint_velocity.shape) != (n,):
+        shape = command.joint_velocity.shape
+        if shape != (n,):
             raise WrongAnswer(
                 f"step must return a Command of shape ({n},), one rad/s a joint, got {shape}",
                 method,
@@ -103,18 +106,18 @@ class HeldController(Controller):
 
     def estimated_jacobian(self) -> FloatArray | None:
         """See `Controller.estimated_jacobian`."""
-        method, wanted = self._controller.estimated_jacobian, (self._spec.m, self._spec.n)
+        method = self._controller.estimated_jacobian
+        wanted = (self._spec.m, self._spec.n)
         estimate = _call(method, "estimated_jacobian(self)")
-        if estimate is not None and (
-            not isinstance(estimate, np.ndarray) or estimate.shape != wanted
-        ):
+        if estimate is None:
+            return None
+        if not isinstance(estimate, np.ndarray) or estimate.shape != wanted:
             text = f"estimated_jacobian must return an array of shape {wanted} or None"
             raise WrongAnswer(f"{text}, got {_kind(estimate)}", method)
-        if estimate is not None and estimate.dtype.kind not in REAL:
-            raise WrongAnswer(
-                f"estimated_jacobian must hold real numbers, got {estimate.dtype}", method
-            )
-        return None if estimate is None else np.asarray(estimate)
+        if estimate.dtype.kind not in REAL:
+            text = f"estimated_jacobian must hold real numbers, got {estimate.dtype}"
+            raise WrongAnswer(text, method)
+        return np.asarray(estimate)
 
 
 @final
@@ -123,7 +126,8 @@ class HeldPlant(Plant):
 
     def __init__(self, plant: Plant) -> None:
         """Take a plant."""
-        self._plant, self.spec = plant, plant.spec
+        self._plant = plant
+        self.spec = plant.spec
 
     def reset(self, seed: int) -> Observation:
         """See `Plant.reset`."""
@@ -135,23 +139,24 @@ class HeldPlant(Plant):
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
-        method, m = self._plant.truth, self.spec.m
+        method = self._plant.truth
+        m = self.spec.m
         truth = _call(method, "truth(self)")
         if not isinstance(truth, Truth):
             raise WrongAnswer(f"truth of the plant must return a Truth, got {_kind(truth)}", method)
         for name, shape in (("feature", (m,)), ("jacobian", (m, self.spec.n))):
             value = getattr(truth, name)
-            if value is not None and np.shape(value) != shape:
-                raise WrongAnswer(
-                    f"truth of the plant: {name} must have shape {shape}, got {np.shape(value)}",
-                    method,
-                )
-            if value is not None and np.asarray(value).dtype.kind not in REAL:
-                text = f"truth of the plant: {name} must hold real numbers, got {np.asarray(value).dtype}"
+            if value is None:
+                continue
+            what = f"truth of the plant: {name}"
+            if np.shape(value) != shape:
+                text = f"{what} must have shape {shape}, got {np.shape(value)}"
                 raise WrongAnswer(text, method)
-        return Truth(
-            _frozen(truth.feature), None if truth.jacobian is None else _frozen(truth.jacobian)
-        )
+            kind = np.asarray(value).dtype
+            if kind.kind not in REAL:
+                raise WrongAnswer(f"{what} must hold real numbers, got {kind}", method)
+        jacobian = None if truth.jacobian is None else _frozen(truth.jacobian)
+        return Truth(_frozen(truth.feature), jacobian)
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -164,7 +169,8 @@ class HeldPlant(Plant):
     def _observation(
         self, method: Callable[..., Any], signature: str, argument: object
     ) -> Observation:
-        observation, name = _call(method, signature, argument), signature.partition("(")[0]
+        observation = _call(method, signature, argument)
+        name, _, _ = signature.partition("(")
         if not isinstance(observation, Observation):
             text = f"{name} of the plant must return an Observation, got {_kind(observation)}"
             raise WrongAnswer(
@@ -181,9 +187,9 @@ class HeldPlant(Plant):
 
 def _copied(observation: Observation) -> Observation:
     """Return an observation whose arrays are its own."""
-    joints, feature, valid = map(
-        _frozen, (observation.joint_position, observation.feature, observation.valid)
-    )
+    joints = _frozen(observation.joint_position)
+    feature = _frozen(observation.feature)
+    valid = _frozen(observation.valid)
     return trusted_observation(observation.time, joints, feature, observation.feature_valid, valid)
 
 
@@ -205,9 +211,8 @@ def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any
         return method(*arguments)
     except TypeError as error:
         trace = error.__traceback__
-        if (
-            trace is None or trace.tb_next is not None
-        ):  # the call was possible, and something behind it was not
+        # With a further frame the call was possible, and something behind it was not.
+        if trace is None or trace.tb_next is not None:
             raise
         raise WrongAnswer(f"{error}; it must be `def {signature}`", method) from None
 

@@ -42,7 +42,8 @@ class Ends:
 
     def __init__(self, count: int) -> None:
         """Start `count` runs."""
-        self.count, self.running = count, np.arange(count)
+        self.count = count
+        self.running = np.arange(count)
         self.faults: dict[int, Exception] = {}
         self.rows: dict[int, int] = {}
 
@@ -53,18 +54,17 @@ class Ends:
             AllEnded: it was the last one.
         """
         if lane not in self.faults:
-            self.faults[lane], self.rows[lane] = fault, rows
+            self.faults[lane] = fault
+            self.rows[lane] = rows
             self.running = self.running[self.running != lane]
         if not len(self.running):
             raise AllEnded
 
     def left_of(self, lanes: LaneIndex) -> LaneIndex | None:
         """Return the places of the runs that are still under way among those that were, or None if all are."""
-        return (
-            None
-            if len(lanes) == len(self.running)
-            else np.flatnonzero(np.isin(lanes, self.running))
-        )
+        if len(lanes) == len(self.running):
+            return None
+        return np.flatnonzero(np.isin(lanes, self.running))
 
     def spread(self, tree: Tree, before: Tree) -> Tree:
         """Return arrays of the runs under way in their places among all runs; the others keep those from before."""
@@ -84,7 +84,10 @@ class ManyBenches(Plant):
     def __init__(self, bench: Bench, ends: Ends) -> None:
         """Take the bench, which has a lane for each run."""
         self.spec: PlantSpec = bench.spec
-        self._bench, self._ends, self._mine, self._k = bench, ends, ends.running, 0
+        self._bench = bench
+        self._ends = ends
+        self._mine = ends.running  # the runs that have a lane of the bench
+        self._k = 0
 
     def reset(self, seed: Any) -> Observation:  # noqa: ANN401 - a seed of each run
         """See `Plant.reset`."""
@@ -97,7 +100,8 @@ class ManyBenches(Plant):
         self._leave()
         if len(self._ends.running) < self._ends.count:
             command = take(command, self._ends.running)
-        observation, lanes = self._bench.step(command), self._ends.running
+        observation = self._bench.step(command)
+        lanes = self._ends.running
         for lane, fault in self._bench.faults.items():
             self._ends.end(int(lanes[lane]), fault, self._k)
         stay = self._leave()
@@ -124,7 +128,8 @@ class ManyBenches(Plant):
 
     def _leave(self) -> LaneIndex | None:
         """Let runs that ended leave the bench; return which of its lanes stay, or None if all do."""
-        stay, self._mine = self._ends.left_of(self._mine), self._ends.running
+        stay = self._ends.left_of(self._mine)
+        self._mine = self._ends.running
         if stay is not None:
             self._bench.keep(stay)
         return stay
@@ -136,7 +141,10 @@ class ManyServos(Controller):
 
     def __init__(self, servo: Servo, ends: Ends) -> None:
         """Take the servo, which has a lane for each run where its parts know the true robot."""
-        self._servo, self._ends, self._mine, self._k = servo, ends, ends.running, 0
+        self._servo = servo
+        self._ends = ends
+        self._mine = ends.running  # the runs that have a lane of the state
+        self._k = 0
 
     def reset(self, observation: Observation, seed: Any) -> None:  # noqa: ANN401 - a seed of each run
         """See `Controller.reset`; no part of a servo draws random numbers."""
@@ -150,8 +158,10 @@ class ManyServos(Controller):
         Raises:
             Exception: a step failed, and repeated with fewer lanes it does not.
         """
-        given, lanes = (observation, reference), self._ends.running
-        stay, self._mine = self._ends.left_of(self._mine), lanes
+        given = (observation, reference)
+        lanes = self._ends.running
+        stay = self._ends.left_of(self._mine)
+        self._mine = lanes
         if stay is not None:
             self._state = take(self._state, stay)
         if len(lanes) < self._ends.count:
@@ -188,7 +198,7 @@ def failing_lanes(
         return []
     if len(lanes) == 1:
         lane = int(lanes[0])
-        # With the words of a single run
+        # The step of a single lane, without the leading axis, fails with the words of a single run.
         return [(lane, _error_of_step(servo, state, given, lane) or error)]
     half = len(lanes) // 2
     return [
@@ -231,13 +241,12 @@ class ManyLogs(StepLog):
 def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     """Return the key that runs of one campaign must share to advance together; None for a run that goes alone."""
     request = run.request
-    if not (
-        find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side
-    ):
+    if not find_plant(request.plant).side_by_side:
         return None
-    if (
-        ".py" in request.sensing
-    ):  # the bits of a user's measure may be others for many robots than for one
+    if not find_controller(request.controller).side_by_side:
+        return None
+    # The bits of a user's measure may be others for many robots than for one.
+    if ".py" in request.sensing:
         return None
     moved = request.mismatch.size("camera_move") > 0.0
     names = request.plant, request.controller, request.task, moved, request.robot, request.sensing
