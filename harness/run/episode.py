@@ -36,7 +36,7 @@ from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 
-ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
+ROWS_AT_ONCE = 2**18  # rows in the logs of runs side by side, half a kilobyte each
 
 
 def run_experiment(request: RunRequest, settings: Settings, *, steps: bool = True) -> RunResult:
@@ -66,7 +66,8 @@ def carry_out(
     """
     INSTANT.value = -math.inf
     experiment = build(resolved)
-    log, ending = StepLog(experiment.plant.spec, experiment.periods), Ending()
+    log = StepLog(experiment.plant.spec, experiment.periods)
+    ending = Ending()
     with same_folder(), contextlib.closing(experiment.plant) as plant, careful():
         try:
             pair = held_to_contract(plant, experiment.controller)
@@ -132,13 +133,14 @@ def _judge_together(
     for lane, (run, drawn) in enumerate(zip(runs, many.runs, strict=True)):
         own = logged.first(ends.rows.get(lane, len(logged)), lane)
         if lane in ends.faults:
-            ending, values = Ending.of(ends.faults[lane]), _judge(own, many)
+            ending = Ending.of(ends.faults[lane])
+            values = _judge(own, many)
         else:
-            ending, values = Ending(), {name: column[lane] for name, column in columns.items()}
+            ending = Ending()
+            values = {name: column[lane] for name, column in columns.items()}
         pose = pose_errors(drawn.true, drawn.scenario.reference, own)
-        results.append(
-            RunResult(_row(drawn, run, ending, values, own, pose), None, trace=ending.trace)
-        )
+        row = _row(drawn, run, ending, values, own, pose)
+        results.append(RunResult(row, None, trace=ending.trace))
     return results
 
 
@@ -157,22 +159,29 @@ def _row(
     pose: Mapping[str, FloatArray],
 ) -> dict[str, Any]:
     """Return the row of a run in the table of runs."""
-    spec, status, outcome = logged.spec, ending.status, ending.status
-    final = final_rows(spec.period)
+    spec = logged.spec
+    outcome = ending.status
     numbers = {name: float(np.asarray(value)) for name, value in metrics.items()}
-    if status == COMPLETED:
-        times = numbers["settling_time_s"], numbers["rms_error_evaluated"]
-        outcome = find_outcome(logged, drawn.scenario, *times, drawn.final)
+    if ending.status == COMPLETED:
+        outcome = find_outcome(
+            logged,
+            drawn.scenario,
+            numbers["settling_time_s"],
+            numbers["rms_error_evaluated"],
+            drawn.final,
+        )
+    final = final_rows(spec.period)
+    final_pose = {name: float(values[final].mean()) for name, values in pose.items() if len(values)}
     return {
         **identity(run),
         "robot": OWN_ROBOT if drawn.true is None else run.request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
         "settling_band": spec.feature.band,
-        "status": status,
+        "status": ending.status,
         "outcome": outcome,
         **numbers,
-        **{name: float(values[final].mean()) for name, values in pose.items() if len(values)},
+        **final_pose,
         "periods": len(logged),
         "reason": ending.reason,
         "mismatch_values": json.dumps(drawn.as_record()),

@@ -193,7 +193,7 @@ def _check_repeated(scenario: Scenario, points: FloatArray, again: Scenario) -> 
 class Experiment:
     """A run made ready, or runs that advance together: true robots drawn, plant and controller built."""
 
-    plant: Plant  # of runs that advance together a bench with a lane for each
+    plant: Plant  # for runs that advance together a bench with a lane for each
     controller: Controller  # likewise
     runs: tuple[Drawn, ...]  # the true robot and the task of each run
     run: RunSettings  # the settings that all of them share
@@ -632,7 +632,7 @@ def _room(mismatch: Mismatch, robot: Robot, points: FloatArray) -> FloatArray:
     longer_tool = math.sqrt(3.0) * mismatch.size("tool")
     longer = REACH_MARGIN + longer_links + longer_tool
     turn = min(math.pi, mismatch.size("camera_rotation") + mismatch.size("camera_move"))
-    chord = 2.0 * math.sin(turn / 2.0)  # of a circle of radius 1
+    chord = 2.0 * math.sin(turn / 2.0)  # [1] for a radius of 1
     radius = np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
     return np.asarray(longer + chord * radius)
 

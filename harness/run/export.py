@@ -42,7 +42,7 @@ from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
 from servobench.plant.kinematic import KinematicConfig
 
-REFERENCE_PERIODS: Final = 200  # of the run inside the FMU, at most
+REFERENCE_PERIODS: Final = 200  # most periods of the run inside the FMU
 TOLERANCE: Final = 1e-9
 STRETCH: Final = 5  # periods, compared on their own where learning magnifies rounding errors
 USUAL: Final = KinematicConfig()  # lag and limits of an exported arm

@@ -38,7 +38,7 @@ from servobench.plant.robot.twin import CAMERA, LENS, ball_rates, deviated, para
 LOG: Final = "the log"  # in error messages
 VELOCITY: Final = COMMAND.removesuffix("_command")  # as commands are misnamed
 MAX_LATENCY: Final = 0.25  # [s]
-LATENCY_STEP: Final = 0.0125  # [s] of the first search
+LATENCY_STEP: Final = 0.0125  # [s] between latencies of the first search
 MIN_FRAMES: Final = 50
 MAX_FRAMES: Final = 6000
 # Prior standard deviation of each kind of parameter, which is the beginning of its name.
@@ -86,8 +86,8 @@ MAX_PRIOR_EFFECT: Final = 1.2  # [1]
 MAX_PRIOR_SHARE: Final = 0.5  # [1]
 OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
 FITS: Final = 4
-RELATIVE_TOLERANCES: Final = (1e-4, 1e-6)  # [1] of the cost, in robust fits and in the last one
-MAX_EVALUATIONS: Final = 5  # of the residuals, for each fit and parameter
+RELATIVE_TOLERANCES: Final = (1e-4, 1e-6)  # [1] tolerances of the cost, in robust fits and the last
+MAX_EVALUATIONS: Final = 5  # evaluations of the residuals for each fit and parameter
 WEISZFELD_STEPS: Final = 5
 ROWS_AT_ONCE: Final = 2**14  # rows of logs for which cameras are placed side by side
 STEP: Final = 1e-6  # [1] step of finite differences, in prior deviations
@@ -238,7 +238,7 @@ class Identified:
     pose: FloatArray  # pose of the camera at θ, (4, 4)
     noise: FloatArray  # Σ, (m, m)
     residuals: FloatArray  # residuals of all valid frames, (k, m)
-    rows: Any  # of these frames in the log, (k,)
+    rows: Any  # rows of these frames in the log, (k,)
     inliers: BoolArray  # which of them are no outliers, (k,)
     correlation: float  # f [frames]
     swing_period: float  # [s]
@@ -508,7 +508,7 @@ class _Problem:
         error = self.errors(z)
         rates = self.jacobian(z)[self.names.index("latency")] / prior("latency")
         weight = np.sum(rates**2, axis=1) + 1e-12
-        late = -np.sum(rates * error, axis=1) / weight  # [s] of each frame
+        late = -np.sum(rates * error, axis=1) / weight  # [s]
         # Cauchy weights, so that outliers count little.
         scaled = late / np.median(np.abs(late))
         weight = np.sqrt(weight / (1.0 + scaled**2))

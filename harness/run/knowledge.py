@@ -53,7 +53,7 @@ class NetworkSource:
     """Networks by training configuration: of this process, read from the cache, or trained on a nominal model."""
 
     nominal_jacobian: JacobianFunction
-    spec: PlantSpec  # of the plant
+    spec: PlantSpec  # names and units of the plant
     progress: Progress | None = None  # called with the share of a training
     given: list[TrainedNetworks] = field(default_factory=list)  # those that a controller asked for
 

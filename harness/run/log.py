@@ -46,15 +46,13 @@ class Steps:
     joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
     command: FloatArray  # (k, ..., n) [rad/s]
     feature_valid: npt.NDArray[np.bool_]  # (k, ...), whether a measurement arrived
-    estimated_jacobian: (
-        FloatArray  # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
-    )
+    # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
+    estimated_jacobian: FloatArray
     true_jacobian: FloatArray  # (k, ..., m, n) [unit of the feature per rad]
     controller_time: FloatArray  # (k,) [µs]
     plant_time: FloatArray  # (k,) [µs]
-    diagnostics: dict[
-        str, FloatArray
-    ]  # (k,) for each number that the controller gave at least once; of one run only
+    # (k,) for each number that the controller gave at least once; for one run only
+    diagnostics: dict[str, FloatArray]
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -62,16 +60,12 @@ class Steps:
 
     def first(self, rows: int, lane: int | None = None) -> Steps:
         """Return the first rows, of all runs or of one of those side by side."""
-        arrays = {item.name: getattr(self, item.name)[:rows] for item in fields(self)[1:-1]}
-        if lane is not None:
-            arrays = {
-                name: array if array.ndim == 1 else array[:, lane] for name, array in arrays.items()
-            }
-        return Steps(
-            self.spec,
-            **arrays,
-            diagnostics={name: all_[:rows] for name, all_ in self.diagnostics.items()},
-        )
+        arrays = {}
+        for item in fields(self)[1:-1]:  # between spec and diagnostics
+            array = getattr(self, item.name)[:rows]
+            arrays[item.name] = array if lane is None or array.ndim == 1 else array[:, lane]
+        diagnostics = {name: values[:rows] for name, values in self.diagnostics.items()}
+        return Steps(self.spec, **arrays, diagnostics=diagnostics)
 
     def error_norm(self) -> FloatArray:
         """Return ‖reference − true feature‖, (k, ...) [unit of the feature]."""
@@ -109,10 +103,8 @@ class Steps:
         columns["jacobian_error"] = self.jacobian_error()
         columns["jacobian_condition"] = self.jacobian_condition()
         columns["feature_valid"] = self.feature_valid
-        columns["controller_time_us"], columns["plant_time_us"] = (
-            self.controller_time,
-            self.plant_time,
-        )
+        columns["controller_time_us"] = self.controller_time
+        columns["plant_time_us"] = self.plant_time
         columns.update((f"diagnostic_{name}", values) for name, values in self.diagnostics.items())
         if full_jacobian:
             columns.update(self._entries("estimated_jacobian", self.estimated_jacobian))
@@ -140,17 +132,26 @@ class StepLog:
             periods: how many rows there is room for.
             lanes: the leading axes of runs side by side.
         """
-        features, joints, jacobian = (*lanes, spec.m), (*lanes, spec.n), (*lanes, spec.m, spec.n)
-        shapes = {
-            **dict.fromkeys(("time", "controller_time", "plant_time"), ()),
-            **dict.fromkeys(("reference", "feature", "true_feature"), features),
-            **dict.fromkeys(("joint_position", "command"), joints),
-            **dict.fromkeys(("estimated_jacobian", "true_jacobian"), jacobian),
-        }
+
+        def empty(*shape: int) -> FloatArray:
+            return np.full((periods, *shape), np.nan)
+
         self._count = 0
-        numbers = {name: np.full((periods, *shape), np.nan) for name, shape in shapes.items()}
-        valid = np.empty((periods, *lanes), dtype=np.bool_)
-        self._rows = Steps(spec, feature_valid=valid, diagnostics={}, **numbers)
+        self._rows = Steps(
+            spec,
+            time=empty(),
+            reference=empty(*lanes, spec.m),
+            feature=empty(*lanes, spec.m),
+            true_feature=empty(*lanes, spec.m),
+            joint_position=empty(*lanes, spec.n),
+            command=empty(*lanes, spec.n),
+            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
+            estimated_jacobian=empty(*lanes, spec.m, spec.n),
+            true_jacobian=empty(*lanes, spec.m, spec.n),
+            controller_time=empty(),
+            plant_time=empty(),
+            diagnostics={},
+        )
 
     def add(self, period: Period, estimate: FloatArray | None, diagnostics: Diagnostics) -> None:
         """Write the next row.
@@ -160,7 +161,10 @@ class StepLog:
             estimate: (..., m, n), the Jacobian that the controller used, or None [unit of the feature per rad].
             diagnostics: the controller's own numbers; a name may come later than the first row.
         """
-        k, rows, observation, truth = self._count, self._rows, period.observation, period.truth
+        k = self._count
+        rows = self._rows
+        observation = period.observation
+        truth = period.truth
         rows.time[k] = observation.time
         rows.reference[k] = period.reference[..., 0, :]
         rows.feature[k] = observation.feature
@@ -172,7 +176,9 @@ class StepLog:
             rows.estimated_jacobian[k] = estimate
         if truth.jacobian is not None:
             rows.true_jacobian[k] = truth.jacobian
-        rows.controller_time[k], rows.plant_time[k] = (time / 1000.0 for time in period.nanoseconds)
+        controller, plant = period.nanoseconds
+        rows.controller_time[k] = controller / 1000.0
+        rows.plant_time[k] = plant / 1000.0
         for name, value in diagnostics.items():
             if name not in rows.diagnostics:
                 rows.diagnostics[name] = np.full(len(rows), np.nan)

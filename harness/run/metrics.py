@@ -21,7 +21,7 @@ from servobench.plant.contract.lanes import norm
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
-ERROR_FLOOR = 0.3  # of the settling band; a smaller error counts as none in `log_error`
+ERROR_FLOOR = 0.3  # share of the settling band; a smaller error counts as none in `log_error`
 LARGE_COMMAND = 0.1  # share of the joint's speed limit from which on a command counts as large
 SWITCH_PERIODS = 2  # within which a change of sign counts as a switch
 
@@ -47,18 +47,18 @@ class Judged:
 
     def __init__(self, steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float) -> None:
         """Arrange the rows; see `judge_run`."""
-        self.steps, self.fixed, self.period = steps, kind == "point_to_point", steps.spec.period
+        self.steps = steps
+        self.fixed = kind == "point_to_point"
+        self.period = steps.spec.period
         self.error = _columns(steps.error_norm())
-        self.feature, self.reference, self.command = map(
-            _columns, (steps.true_feature, steps.reference, steps.command)
-        )
+        self.feature = _columns(steps.true_feature)
+        self.reference = _columns(steps.reference)
+        self.command = _columns(steps.command)
         begins = np.array([evaluate_from, lap_time, 2.0 * lap_time])
         judged_from, second, third = np.searchsorted(steps.time, begins - 1e-9)
-        self.evaluated, self.second_lap = (
-            self.error[..., judged_from:],
-            self.error[..., second:third],
-        )
-        # Without the step from rest
+        self.evaluated = self.error[..., judged_from:]
+        self.second_lap = self.error[..., second:third]
+        # The step from rest to the first command does not count.
         self.acceleration = np.diff(self.command, axis=-1) / self.period
         self.jerk = np.diff(self.acceleration, axis=-1) / self.period
 
@@ -124,18 +124,19 @@ def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> Floa
     Returns:
         (...) [s]; NaN if the error is outside at the end, or came in less than `DWELL` before it.
     """
-    count, band = error.shape[-1], np.asarray(band)
+    count = error.shape[-1]
+    band = np.asarray(band)
     outside = ~(error <= band[..., None])
-    first = np.where(outside.any(axis=-1), count - outside[..., ::-1].argmax(axis=-1), 0)
+    after_last_outside = count - outside[..., ::-1].argmax(axis=-1)
+    first = np.where(outside.any(axis=-1), after_last_outside, 0)
     settled = (count - first) * period >= DWELL - 1e-9
     row = np.where(settled, first, 0)[..., None]
-    before, after = (
-        np.take_along_axis(error, rows, axis=-1)[..., 0] for rows in (np.maximum(row - 1, 0), row)
-    )
-    with np.errstate(
-        divide="ignore", invalid="ignore"
-    ):  # where the first row is inside, or no row stays inside
-        crossing = first - np.where(first > 0, (band - after) / (before - after), 0.0)
+    before = np.take_along_axis(error, np.maximum(row - 1, 0), axis=-1)[..., 0]
+    after = np.take_along_axis(error, row, axis=-1)[..., 0]
+    # The share is no number where the first row is inside, or where no row stays inside.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (band - after) / (before - after)
+        crossing = first - np.where(first > 0, share, 0.0)
     return np.where(settled, crossing * period, np.nan)
 
 
@@ -195,26 +196,26 @@ def final_rows(period: float) -> slice:
 
 
 def _path_length_ratio(run: Judged) -> FloatArray:
-    way = (
-        norm(run.reference[..., 0] - run.feature[..., 0])
-        if run.fixed
-        else path_length(run.reference)
-    )
+    """Return the length of the true path over that of the shortest one; NaN where nothing has to move."""
+    way = path_length(run.reference)
+    if run.fixed:
+        way = norm(run.reference[..., 0] - run.feature[..., 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(way > 0.0, path_length(run.feature) / way, np.nan)
 
 
 def _saturation(run: Judged) -> FloatArray:
-    at_limit = np.abs(run.command) >= run.steps.spec.joint_velocity_limit[:, None] * (1 - 1e-9)
+    limit = run.steps.spec.joint_velocity_limit[:, None] * (1 - 1e-9)
+    at_limit = np.abs(run.command) >= limit
     return np.asarray(at_limit.any(axis=-2).mean(axis=-1))
 
 
 def _overruns(run: Judged) -> FloatArray:
     """Return the number of steps of the controller that took longer than the period; NaN where times are unknown."""
     times = run.steps.controller_time
-    return run.same(
-        math.nan if np.isnan(times).any() else float(np.count_nonzero(times > 1e6 * run.period))
-    )
+    if np.isnan(times).any():
+        return run.same(math.nan)
+    return run.same(float(np.count_nonzero(times > 1e6 * run.period)))
 
 
 def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -228,19 +229,21 @@ def _peak(run: Judged, values: FloatArray) -> FloatArray:
 
 def _rms(run: Judged, values: FloatArray) -> FloatArray:
     """Return the root mean square over the last axis; NaN where it is empty."""
-    return (
-        np.asarray(np.sqrt(np.mean(values**2, axis=-1))) if values.shape[-1] else run.same(np.nan)
-    )
+    if not values.shape[-1]:
+        return run.same(np.nan)
+    return np.asarray(np.sqrt(np.mean(values**2, axis=-1)))
 
 
 def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatArray:
     """Return the mean or maximum over periods, (...), of those values (..., k) that are not NaN; NaN without any."""
-    if not np.isnan(values).any():
+    unknown = np.isnan(values)
+    if not unknown.any():
         return np.asarray(summary(values, axis=-1))
-    rows = [row[~np.isnan(row)] for row in values.reshape(-1, values.shape[-1])]
-    return np.array([summary(row) if len(row) else np.nan for row in rows]).reshape(
-        values.shape[:-1]
-    )
+    summaries = []
+    for row in values.reshape(-1, values.shape[-1]):
+        known = row[~np.isnan(row)]
+        summaries.append(summary(known) if len(known) else np.nan)
+    return np.array(summaries).reshape(values.shape[:-1])
 
 
 _ALL: Final = (

@@ -33,12 +33,12 @@ SETTLED, NOT_SETTLED = "settled", "not_settled"
 FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"
 TARGET_UNREACHABLE, JOINT_AT_LIMIT = "target_unreachable", "joint_at_limit"
 ACHIEVED: Final = (SETTLED, FOLLOWED)
-# Without the faults
+# The outcomes of runs that complete.
 OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)
 FOLLOWING_BANDS: Final = 2.0  # settling bands: an RMS error of 10 mm on the UR5
 AT_STOP: Final = 1e-6  # [rad] from a joint's stop
 HELD: Final = 1.0  # [s] at a stop
-CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
+CURVE_POINTS: Final = 32  # points of the judged part of a curve that must be in reach
 
 
 def find_outcome(
@@ -73,24 +73,28 @@ def find_outcome(
 
 def joint_rests_at_limit(steps: Steps, band: float) -> bool:
     """Return whether a joint of a single run stays at its stop for a second while the error is outside the band."""
-    q, spec = steps.joint_position, steps.spec
-    at_stop = (q >= spec.joint_upper - AT_STOP) | (q <= spec.joint_lower + AT_STOP)
-    held = at_stop & (steps.error_norm() > band)[:, None]
+    q = steps.joint_position
+    spec = steps.spec
+    at_upper = q >= spec.joint_upper - AT_STOP
+    at_lower = q <= spec.joint_lower + AT_STOP
+    outside = steps.error_norm() > band
+    held = (at_upper | at_lower) & outside[:, None]
     rows = max(1, math.ceil(HELD / spec.period - 1e-9))
-    count = np.vstack([np.zeros((1, spec.n), dtype=np.intp), np.cumsum(held, axis=0)])
+    # The difference of two running counts is the number of held rows between them.
+    start = np.zeros((1, spec.n), dtype=np.intp)
+    count = np.vstack([start, np.cumsum(held, axis=0)])
     return bool((count[rows:] - count[:-rows] == rows).any())
 
 
 def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, band: float) -> bool:
-    judged = steps.reference[np.searchsorted(steps.time, evaluate_from - 1e-9) :]
-    points: FloatArray = np.unique(judged[:: max(1, len(judged) // CURVE_POINTS)], axis=0)
+    """Return whether the target, or a point of the judged part of a curve, is farther out of reach than the band."""
     spec = steps.spec
-    return bool(
-        (
-            closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper)
-            > band
-        ).any()
-    )
+    judged = steps.reference[np.searchsorted(steps.time, evaluate_from - 1e-9) :]
+    stride = max(1, len(judged) // CURVE_POINTS)
+    points: FloatArray = np.unique(judged[::stride], axis=0)
+    places = robot.to_base(points)
+    distances = closest_distance(robot.arm, places, spec.joint_lower, spec.joint_upper)
+    return bool((distances > band).any())
 
 
 def pose_errors(
@@ -123,7 +127,10 @@ def pose_error(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, Floa
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
-    middle, goal = points.mean(axis=-2), wanted.mean(axis=-2)
-    correlation = (points - middle[..., None, :]).mT @ (wanted - goal[..., None, :])
-    rotation = Rotation.from_matrix(nearest_rotation(correlation).reshape(-1, 3, 3))
-    return norm(middle - goal), rotation.magnitude().reshape(middle.shape[:-1])
+    middle = points.mean(axis=-2)
+    goal = wanted.mean(axis=-2)
+    about_middle = points - middle[..., None, :]
+    about_goal = wanted - goal[..., None, :]
+    matrices = nearest_rotation(about_middle.mT @ about_goal)
+    angles = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).magnitude()
+    return norm(middle - goal), angles.reshape(middle.shape[:-1])

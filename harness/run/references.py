@@ -54,7 +54,8 @@ class Reference(ABC):
             raise ConfigurationError(
                 f"the task's reference needs a row for each of {count} times, got {rows.shape}"
             )
-        if not (finite := np.isfinite(rows).all(axis=-1)).all():
+        finite = np.isfinite(rows).all(axis=-1)
+        if not finite.all():
             first = int(finite.argmin())
             wanted = "the reference of the task must be finite over the run and beyond it, as far as it is previewed"
             raise ConfigurationError(
@@ -186,27 +187,32 @@ class TaughtImage(ImageReference):
 class FollowedCurve(ImageReference):
     """The target on a curve in space, as above."""
 
-    curve: Reference  # of a ball in the frame of a fixed camera, (3,) [m]
+    curve: Reference  # path of a ball in the frame of a fixed camera, (3,) [m]
     robot: Robot  # whose home gives the orientation, and whose workspace the curve is in
 
     def points(self, time: npt.ArrayLike) -> FloatArray:
         """Return the place at each time."""
         home = self.model.points(self.robot.workspace.home)
-        ratio, pose = self.model.distance / self.robot.workspace.camera_distance, self.model.camera
-        curve = (
-            ratio * self.curve.at(time)
-            if self.robot.camera is None
-            else self._in_own_image(ratio, time)
-        )
+        pose = self.model.camera
+        curve = self._in_camera(time)
         place = np.matvec(pose[:3, :3], curve) + pose[:3, 3]
-        return np.asarray(place[..., None, :] + (home - home.mean(axis=-2)))
+        about_middle = home - home.mean(axis=-2)
+        return np.asarray(place[..., None, :] + about_middle)
 
-    def _in_own_image(self, ratio: float, time: npt.ArrayLike) -> FloatArray:
-        """Return the curve in the frame of a user's camera, (..., 3) m, given the ratio of the distances."""
-        work, image, pose = self.robot.workspace, self.robot.pinhole, self.robot.camera_pose
+    def _in_camera(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the curve in the frame of the camera, (..., 3) m, no larger than it fits into a user's image."""
+        work = self.robot.workspace
+        ratio = self.model.distance / work.camera_distance
+        if self.robot.camera is None:
+            return np.asarray(ratio * self.curve.at(time))
+        image = self.robot.pinhole
         middle = work.centre
+        pose = self.robot.camera_pose
         if self.model.mount == "hand":
-            middle, pose = self.model.points(work.home).mean(axis=-2), self.model.camera
+            middle = self.model.points(work.home).mean(axis=-2)
+            pose = self.model.camera
+        # The half angle of view over that of the bench's camera.
         seen = min(image.width, image.height) / image.focal * CAMERA.focal / CAMERA.height
         about = self.curve.at(time) - (0.0, 0.0, work.camera_distance)
-        return np.asarray(min(1.0, ratio * seen) * about + (middle - pose[:3, 3]) @ pose[:3, :3])
+        shrunk = min(1.0, ratio * seen) * about
+        return np.asarray(shrunk + (middle - pose[:3, 3]) @ pose[:3, :3])

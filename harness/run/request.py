@@ -41,12 +41,12 @@ NAMES = ("plant", "controller", "task", "robot", "sensing")  # fields of a reque
 class ShortName(NamedTuple):
     """A short name for a setting that sweeps often vary; it has a column of its own, and a part of the run's name."""
 
-    key: str  # of the setting, `SECTION.KEY`
+    key: str  # key of the setting, `SECTION.KEY`
     column: str  # in the table of runs
-    heading: str  # of this column where it is shown, with the unit
+    heading: str  # heading of this column where it is shown, with the unit
     usual: float | None = None  # in this column for runs that do not vary the setting
     scale: float = 1e3  # from the value to the number that is shown
-    unit: str = "ms"  # of this number
+    unit: str = "ms"  # unit of this number
 
 
 SHORT_NAMES: Final[Mapping[str, ShortName]] = {
@@ -55,7 +55,7 @@ SHORT_NAMES: Final[Mapping[str, ShortName]] = {
     "period": ShortName("run.period", "period_s", "period [ms]"),
 }
 ROLES: Final = ("plant", "controller", "task")
-# With which the key of a varied setting begins
+# The beginnings of the key of a varied setting.
 SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))
 ORDER: Final = {short.key: order for order, short in enumerate(SHORT_NAMES.values())}
 
@@ -104,7 +104,7 @@ class RunRequest:
     controller: str
     task: str
     mismatch: Mismatch  # how far the true robot may be from the nominal one; its text is read, too
-    seed: int  # of everything random in the run
+    seed: int  # seed of everything random in the run
     varied: Varied = ()
     """settings of this run alone, by short name or `SECTION.KEY`; a mapping is read, too. Sections are `run`, `plant`,
     `controller` and `task`, or the names of these three"""
@@ -167,14 +167,13 @@ class RunRequest:
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        robot = (
-            ""
-            if self.robot == DEFAULT_ROBOT
-            else f"{short_name(self.robot).replace(catalogue.WITH, '+')}-"
-        )
+        robot = ""
+        if self.robot != DEFAULT_ROBOT:
+            robot = f"{short_name(self.robot).replace(catalogue.WITH, '+')}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{Path(self.sensing).name}-"
         varied = "".join(map(_in_name, self.varied))
-        name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}-{self.seed}"
+        method = f"{robot}{sensing}{self.controller}"
+        name = f"{self.plant}-{method}-{self.task}-{self.mismatch}{varied}-{self.seed}"
         return UNFIT_FOR_FILES.sub("_", name)
 
     def as_row(self) -> dict[str, Any]:
@@ -195,24 +194,18 @@ class RunRequest:
 
 def varied_in_row(row: Mapping[str, Any]) -> Varied:
     """Return the settings that a run varies, by key, from its row in a table of runs."""
-    usual = {short.column: short.usual for short in SHORT_NAMES.values()}
-    columns = {short.column: short.key for short in SHORT_NAMES.values()} | {
-        key: key for key in row if "." in key
-    }
-    values = {
-        key: row[name]
-        for name, key in columns.items()
-        if row.get(name) not in (None, usual.get(name))
-    }
-    given = {
-        key: json.loads(value) if str(value).startswith("[") else value
-        for key, value in values.items()
-    }
-    return tuple(
-        (key, value)
-        for key, value in given.items()
-        if not (isinstance(value, float) and math.isnan(value))
-    )
+    columns = [(short.column, short.key, short.usual) for short in SHORT_NAMES.values()]
+    columns += [(key, key, None) for key in row if "." in key]
+    varied = {}
+    for column, key, usual in columns:
+        value = row.get(column)
+        if value in (None, usual):
+            continue
+        if str(value).startswith("["):  # the JSON text of a list
+            value = json.loads(value)
+        if not (isinstance(value, float) and math.isnan(value)):
+            varied[key] = value
+    return tuple(varied.items())
 
 
 def varied_columns(columns: Iterable[str]) -> dict[str, tuple[str, float]]:

@@ -39,7 +39,7 @@ class Scenario:
     duration: float  # [s]
     evaluate_from: float  # where the evaluated part begins [s]
     kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
-    lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
+    lap_time: float = math.nan  # time of a lap of a curve that is repeated [s]; NaN of any other
 
     def __post_init__(self) -> None:
         """Check that the evaluated part is one of the run, and the kind."""

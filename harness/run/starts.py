@@ -40,15 +40,14 @@ from servobench.plant.robot.robot import Robot
 
 DRAWN_AT_ONCE: Final = 256
 MAX_DRAWS: Final = 25_600
-PLANNED_SHARE: Final = (
-    0.8  # of the images' half sides in which the planned cameras see the features
-)
-TRUE_SHARE: Final = 0.95  # the same of the true ones
+# Shares of the images' half sides within which the planned and the true cameras see the features.
+PLANNED_SHARE: Final = 0.8
+TRUE_SHARE: Final = 0.95
 FACING: Final = 0.7  # cosine of the angle between the target's front and the camera: 45°
-REACHED: Final = 1e-6  # of the error that `reach_pose` returns
-SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)  # of D that are tried
+REACHED: Final = 1e-6  # largest error of `reach_pose` for a pose that is reached
+SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)  # shares of D that are tried
 STEPS: Final = 8  # in which the arm is led from home to the start
-IN_VIEW: Final = 0.9  # of the image's half sides in which the target is at the start
+IN_VIEW: Final = 0.9  # share of the image's half sides within which the target is at the start
 
 
 class Box(NamedTuple):
@@ -75,17 +74,16 @@ def draw_in_view(
     Raises:
         ValueError: too few postures are fit.
     """
-    # The same way in the image, however near the camera is
+    # The same distance in the image, however near the camera is.
     least = box.shortest * nominal.noise_unit
-    found, features = (
-        np.empty((MAX_DRAWS, robot.n)),
-        np.empty((MAX_DRAWS, len(nominal.channel.names))),
-    )
+    found = np.empty((MAX_DRAWS, robot.n))
+    features = np.empty((MAX_DRAWS, len(nominal.channel.names)))
     count = 0
     for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
         drawn = generator.uniform(box.lower, box.upper, (DRAWN_AT_ONCE, robot.n))
         for posture in drawn[_fit(drawn, box, robot, nominal, true)]:
-            found[count], features[count] = posture, nominal.feature(posture)
+            found[count] = posture
+            features[count] = nominal.feature(posture)
             far = norm(features[count] - features[:count]) >= least
             if far.any():
                 return found[far.argmax()], posture
@@ -109,12 +107,9 @@ def drawn_together(
         both = home + 0.1 * tenths * (np.stack([start, target]) - home)
         if _in_view(both, nominal, true).all():
             return (start, target) if tenths == 10 else (both[0], both[1])
-    own = robot.camera
-    remedy = (
-        f"look at [pose] in {own.name}, whose z axis is the optical axis"
-        if own
-        else "use another mismatch"
-    )
+    remedy = "use another mismatch"
+    if robot.camera:
+        remedy = f"look at [pose] in {robot.camera.name}, whose z axis is the optical axis"
     raise ValueError(
         f"start and target must be in view, and near the arm's home they are not; {remedy}"
     )
@@ -134,12 +129,12 @@ def _fit(
 def _in_view(postures: FloatArray, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:
     """Return in which postures (k, n) rad the cameras see all features as they should, (k,)."""
     points = nominal.points(postures)
-    planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1) & (
-        nominal.incidence(points) >= FACING
-    )
-    # Marks may be larger in a user's image
+    planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1)
+    facing = nominal.incidence(points) >= FACING
+    # Marks may be larger in a user's image.
     share = TRUE_SHARE if nominal.planned == CAMERA else PLANNED_SHARE
-    return np.asarray(planned & true.valid_at(true.points(postures), share).all(axis=-1))
+    seen = true.valid_at(true.points(postures), share).all(axis=-1)
+    return np.asarray(planned & facing & seen)
 
 
 @settings
@@ -170,7 +165,8 @@ class PoseTask(Task):
 
 def displaced(config: PoseTask, middle: FloatArray) -> FloatArray:
     """Return D, (4, 4), for a target whose middle is at (3,) m in the camera frame at home; see the module."""
-    D, angle = np.eye(4), np.radians(config.angle)
+    D = np.eye(4)
+    angle = np.radians(config.angle)
     match config.displacement:
         case "axis_turn":
             D[:3, :3] = rotation_matrix([0.0, 0.0, angle])
@@ -190,8 +186,8 @@ def pose_start(config: PoseTask, robot: Robot, nominal: SetupModel) -> FloatArra
     Raises:
         ValueError: no share of the displacement can be reached with the target in view.
     """
-    camera, home = nominal.camera, robot.workspace.home
-    inverse = np.linalg.inv(camera)
+    home = robot.workspace.home
+    inverse = np.linalg.inv(nominal.camera)
     middle = inverse[:3, :3] @ nominal.points(home).mean(axis=0) + inverse[:3, 3]
     for share in SHARES:
         start = _led(config, share, robot, nominal, middle)
@@ -206,16 +202,17 @@ def _led(
     config: PoseTask, share: float, robot: Robot, nominal: SetupModel, middle: FloatArray
 ) -> FloatArray | None:
     """Return the joint positions at a share of the displacement, led there from home in steps; None if out of reach."""
-    arm, limits, q, camera = robot.arm, robot.limits, robot.workspace.home, nominal.camera
-    at_home = arm.frames(q)[-1]
+    limits = robot.limits
+    camera = nominal.camera
+    q = robot.workspace.home
+    at_home = robot.arm.frames(q)[-1]
     for step in np.linspace(0.0, share, STEPS + 1)[1:].tolist():
-        D = displaced(
-            replace(config, angle=step * config.angle, nearer=step * config.nearer), middle
-        )
-        # of the target in the frame that the camera is mounted on
+        part = replace(config, angle=step * config.angle, nearer=step * config.nearer)
+        D = displaced(part, middle)
+        # The motion of the target in the frame that the camera is mounted on.
         moved = camera @ D @ np.linalg.inv(camera)
         pose = moved @ at_home if nominal.mount == "fixed" else at_home @ np.linalg.inv(moved)
-        q, error = reach_pose(arm, pose, q, limits.lower, limits.upper)
+        q, error = reach_pose(robot.arm, pose, q, limits.lower, limits.upper)
         if error > REACHED:
             return None
     return q

@@ -55,15 +55,6 @@ UNITS: Final = {
 }
 
 
-class _Estimate(NamedTuple):
-    """A row of the table of estimates, in the printed unit."""
-
-    parameter: str
-    estimate: float
-    deviation: float
-    unit: str
-
-
 def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
     """Return a table of the parameters that a log tells, with intervals of 95 %; differences from the nominal robot."""
     rows = []
@@ -71,12 +62,12 @@ def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
         deviations = np.sqrt(np.diag(response.covariance))
         for name, value, deviation in zip(TIMES[1:], response[:2], deviations, strict=True):
             printed = max(deviation, MIN_DEVIATION)
-            rows.append(_Estimate(name, 1e3 * value, 1e3 * printed, "ms"))
+            rows.append((name, 1e3 * value, 1e3 * printed, "ms"))
     for k, name in enumerate(robot.names):
         if robot.told[k] and name not in EXTRAS:
             unit, per = UNITS.get(kind_of(name), ("", 1.0))
-            rows.append(_Estimate(name, per * robot.values[k], per * robot.deviations[k], unit))
-    table = pd.DataFrame(rows, columns=list(_Estimate._fields))
+            rows.append((name, per * robot.values[k], per * robot.deviations[k], unit))
+    table = pd.DataFrame(rows, columns=["parameter", "estimate", "deviation", "unit"])
     deviation = table.pop("deviation")
     # As many digits as leave two of an interval of two deviations.
     digits = np.maximum(0, 1 - np.floor(np.log10(2.0 * deviation))).astype(int)
@@ -352,7 +343,7 @@ class Waiting(NamedTuple):
     mean: float  # [s]
     deviation: float  # [s]
     missing: float  # [1] share of the periods without a new frame
-    swing: float = 0.0  # [s] of a fit to the frames that are seen
+    swing: float = 0.0  # [s] amplitude fitted to the frames that are seen
 
 
 def arrivals(
