@@ -72,11 +72,9 @@ def controller_model(request: RunRequest, settings: Settings) -> ControllerModel
 def _model(
     entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
 ) -> ControllerModel:
-    controller, spec, name = (
-        experiment.controller,
-        experiment.plant.spec,
-        f"controller {entry.name!r}",
-    )
+    controller = experiment.controller
+    spec = experiment.plant.spec
+    name = f"controller {entry.name!r}"
     if not isinstance(controller, ServoController):
         raise ConfigurationError(
             f"{name} cannot be exported: it is not composed of an estimator and a law"
@@ -94,10 +92,8 @@ def _model(
         if each.role == INPUT
     }
     columns, states = _run(experiment)
-    inputs, outputs = (
-        np.column_stack([columns[each] for each in names])
-        for names in (shapes, (COMMAND, JACOBIAN))
-    )
+    inputs = np.column_stack([columns[each] for each in shapes])
+    outputs = np.column_stack([columns[COMMAND], columns[JACOBIAN]])
     try:
         recorded = record(
             controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes
@@ -135,11 +131,15 @@ def _repeated_periods(
 
     def differences(stretch: int) -> FloatArray:
         """Return that of each period, (k,), as `fmu validate` counts it; a stretch begins at the original's state."""
-        came, state = np.empty_like(outputs), states[0]
+        repeated = np.empty_like(outputs)
+        state = states[0]
         for k, row in enumerate(inputs):
-            state, output, _ = recorded.step(state if k % stretch else states[k // STRETCH], row)
-            came[k] = np.asarray(output).reshape(-1)
-        return np.asarray((np.abs(came - outputs) / np.maximum(1.0, np.abs(outputs))).max(axis=1))
+            if k % stretch == 0:
+                state = states[k // STRETCH]
+            state, output, _ = recorded.step(state, row)
+            repeated[k] = np.asarray(output).reshape(-1)
+        sizes = np.maximum(1.0, np.abs(outputs))
+        return np.asarray((np.abs(repeated - outputs) / sizes).max(axis=1))
 
     whole = differences(len(inputs))
     if whole.max() <= TOLERANCE:
@@ -181,25 +181,27 @@ def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray
     Returns:
         Time, inputs and outputs by name, (k, size), and the numbers of the state after every `STRETCH` periods.
     """
-    controller, spec = experiment.controller, experiment.plant.spec
+    controller = experiment.controller
+    spec = experiment.plant.spec
     length = LoopSettings(experiment.periods, experiment.run.preview_rows)
     rollout = begin(experiment.plant, controller, experiment.desired(), length, (0, 0))
     unknown = np.zeros((spec.m, spec.n))
-    rows, states = [], []
+    rows = []
+    states = []
     try:
         for period in islice(periods(rollout, controller), REFERENCE_PERIODS):
-            observation, estimate = period.observation, controller.estimated_jacobian()
-            given = (
+            observation = period.observation
+            estimate = controller.estimated_jacobian()
+            row = (
+                observation.time,
                 observation.joint_position,
                 observation.feature,
                 observation.valid,
                 np.ravel(period.reference),
-            )
-            answers = (
                 period.command.joint_velocity,
                 np.ravel(unknown if estimate is None else estimate),
             )
-            rows.append((observation.time, *given, *answers))
+            rows.append(row)
             if len(rows) % STRETCH == 0:
                 states.append(np.hstack([*map(np.ravel, leaves_of(controller.save()))]))
     except RunFault as fault:
@@ -208,9 +210,8 @@ def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray
                 f"the run that is kept inside the FMU failed at once: {fault}"
             ) from fault
     columns = (np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
-    return dict(
-        zip(("time", POSITION, FEATURE, SEEN, REFERENCE, COMMAND, JACOBIAN), columns, strict=True)
-    ), states
+    names = ("time", POSITION, FEATURE, SEEN, REFERENCE, COMMAND, JACOBIAN)
+    return dict(zip(names, columns, strict=True)), states
 
 
 def arm_product(
@@ -228,10 +229,11 @@ def arm_product(
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
-    moves = ["camera_move"] * (request.mismatch.size("camera_move") > 0.0)
-    for part, _, name in (
-        each.rpartition(".") for each in [*request.mismatch.plant_settings, *moves]
-    ):
+    unknown = list(request.mismatch.plant_settings)
+    if request.mismatch.size("camera_move") > 0.0:
+        unknown.append("camera_move")
+    for setting in unknown:
+        part, _, name = setting.rpartition(".")
         remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
         raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
     true, *_ = draw_robot(request)
@@ -256,7 +258,9 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
             raise ConfigurationError(
                 f"the arm of an SSP has {has}: leave {request.plant}.{key} out"
             )
-    scenario, run, config = draw(resolved).scenario, resolved.run, resolved.plant
+    scenario = draw(resolved).scenario
+    run = resolved.run
+    config = resolved.plant
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
     arm = KinematicConfig(
         config.max_joint_speed, config.joint_range, config.lag, mechanics=config.mechanics

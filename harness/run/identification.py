@@ -86,7 +86,8 @@ MAX_PRIOR_EFFECT: Final = 1.2  # [1]
 MAX_PRIOR_SHARE: Final = 0.5  # [1]
 OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
 FITS: Final = 4
-RELATIVE_TOLERANCES: Final = (1e-4, 1e-6)  # [1] tolerances of the cost, in robust fits and the last
+ROBUST_TOLERANCE: Final = 1e-4  # [1] relative tolerance of the cost in robust fits
+LAST_TOLERANCE: Final = 1e-6  # [1] and in the last one
 MAX_EVALUATIONS: Final = 5  # evaluations of the residuals for each fit and parameter
 WEISZFELD_STEPS: Final = 5
 ROWS_AT_ONCE: Final = 2**14  # rows of logs for which cameras are placed side by side
@@ -685,7 +686,7 @@ def identify(
     inliers = np.ones(len(problem.rows), dtype=np.bool_)
     deviation = max(problem.spread, 1e-4 * log.spec.feature.scale)
     noise = np.eye(log.spec.m) * deviation**2
-    robust_tolerance, last_tolerance = RELATIVE_TOLERANCES
+
     for left in reversed(range(fits)):
         root = np.linalg.inv(np.linalg.cholesky(noise))
         z = problem.recentred(z)
@@ -695,10 +696,10 @@ def identify(
         if left:
             # The square roots of the weights of a soft L1 loss.
             weights = np.asarray((1.0 + distances) ** -0.25, dtype=np.float64)
-            tolerance = robust_tolerance
+            tolerance = ROBUST_TOLERANCE
         else:
             weights = np.asarray(inliers, dtype=np.float64)
-            tolerance = last_tolerance
+            tolerance = LAST_TOLERANCE
         solved: Any = least_squares(
             partial(problem.weighted, root=root, weights=weights),
             z,

@@ -134,22 +134,22 @@ class StepLog:
         """
 
         def empty(*shape: int) -> FloatArray:
-            return np.full((periods, *shape), np.nan)
+            return np.full((periods, *lanes, *shape), np.nan)
 
         self._count = 0
         self._rows = Steps(
             spec,
-            time=empty(),
-            reference=empty(*lanes, spec.m),
-            feature=empty(*lanes, spec.m),
-            true_feature=empty(*lanes, spec.m),
-            joint_position=empty(*lanes, spec.n),
-            command=empty(*lanes, spec.n),
+            time=np.full(periods, np.nan),
+            reference=empty(spec.m),
+            feature=empty(spec.m),
+            true_feature=empty(spec.m),
+            joint_position=empty(spec.n),
+            command=empty(spec.n),
             feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
-            estimated_jacobian=empty(*lanes, spec.m, spec.n),
-            true_jacobian=empty(*lanes, spec.m, spec.n),
-            controller_time=empty(),
-            plant_time=empty(),
+            estimated_jacobian=empty(spec.m, spec.n),
+            true_jacobian=empty(spec.m, spec.n),
+            controller_time=np.full(periods, np.nan),
+            plant_time=np.full(periods, np.nan),
             diagnostics={},
         )
 

@@ -131,7 +131,7 @@ def resolve_sections(
                 f"plant and controller are both called {request.plant!r}; give one another name"
             )
     robots = list(dict.fromkeys(each.robot for each in requests)) or [DEFAULT_ROBOT]
-    if len(robots) > 1:  # of which they share the settings of plants and tasks
+    if len(robots) > 1:  # Settings of plants and tasks are those for one robot.
         raise ConfigurationError(
             f"a batch has one robot, got {', '.join(robots)}; use a batch for each"
         )
@@ -190,16 +190,11 @@ def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # no
         )
     config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)
     with configuration_errors():
-        config = (
-            config
-            if camera is None
-            else replace(config, sensing=camera.sensing(config.sensing, period))
-        )
-        return (
-            config
-            if robot.twin is None
-            else override(name, config, robot.twin.plant_settings(config, period))
-        )
+        if camera is not None:
+            config = replace(config, sensing=camera.sensing(config.sensing, period))
+        if robot.twin is not None:
+            config = override(name, config, robot.twin.plant_settings(config, period))
+        return config
 
 
 def select(request: RunRequest, sections: Sections) -> ResolvedRun:
@@ -216,14 +211,14 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
         raise ConfigurationError(
             f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}"
         )
-    plant, of_profile = request.varied_in("plant"), _of_profile(request, sections)
-    run, robot = sections.with_changes("run", request.varied_in("run")), find_robot(request.robot)
+    plant = request.varied_in("plant")
+    of_profile = _of_profile(request, sections)
+    run = sections.with_changes("run", request.varied_in("run"))
+    robot = find_robot(request.robot)
     frames = sections.frames(request.plant, robot, run.period)
-    drawn = (
-        ()
-        if robot.twin is None
-        else _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
-    )
+    drawn: Varied = ()
+    if robot.twin is not None:
+        drawn = _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
     if both := [key for key, _ in plant if key in of_sensor]:
         raise ConfigurationError(
             f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too"
@@ -261,10 +256,8 @@ def _of_profile(request: RunRequest, sections: Sections) -> dict[str, float]:
     profile = PROFILE_SETTINGS.get(request.mismatch.profile, {})
     if not profile:
         return {}
-    own, given = (
-        {field.name for field in fields(sections[request.plant])},
-        sections.given.get(request.plant, ()),
-    )
+    own = {field.name for field in fields(sections[request.plant])}
+    given = sections.given.get(request.plant, ())
     return {
         key: value
         for key, value in profile.items()
