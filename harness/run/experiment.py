@@ -9,7 +9,7 @@ import contextlib
 import copy
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, Final
@@ -327,7 +327,13 @@ def _assemble(
                 configuration_errors(f"plant {request.plant}: "),
             ):
                 plant.move_camera(true.camera)
-        knowledge, trained = _knowledge(resolved, plant, robot)
+        if robot is None:
+            jacobian = plant.nominal_jacobian()
+            knowledge = RobotKnowledge(plant.spec, run.preview_rows, jacobian)
+            trained = knowledge
+        else:
+            nominal = find_sensing(request.sensing).nominal(robot)
+            knowledge, trained = nominal_knowledge(robot, nominal, plant.spec, run)
         source = network_source(trained, progress)
         true_model = partial(_true_model, plant, true)
         with naming_the_lack(plant, own_robot=robot is None):
@@ -336,18 +342,6 @@ def _assemble(
         plant.close()
         raise
     return plant, controller, () if source is None else source.given
-
-
-def _knowledge(
-    resolved: ResolvedRun, plant: Plant, robot: Robot | None
-) -> tuple[RobotKnowledge, RobotKnowledge]:
-    """Return the knowledge of a controller, and that for training networks; None for a plant's own robot."""
-    run = resolved.run
-    if robot is None:
-        own = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
-        return own, own
-    nominal = find_sensing(resolved.request.sensing).nominal(robot)
-    return nominal_knowledge(robot, nominal, plant.spec, run)
 
 
 @contextlib.contextmanager
@@ -394,18 +388,16 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     scenario = experiment.scenario
     spec = experiment.plant.spec
     for what, values in (("start", scenario.start), ("target", run.task.taught_at)):
-        if values is not None:
-            _check_limits(f"task {run.request.task}: {what}", values, spec)
+        if values is None:
+            continue
+        limited = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
+        for joint, value, lower, upper in limited:
+            if not lower <= value <= upper:
+                wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
+                raise ConfigurationError(
+                    f"task {run.request.task}: {what} must be {wanted}, got {value:g}"
+                )
     _check_reach(run, scenario, spec)
-
-
-def _check_limits(what: str, values: Iterable[float], spec: PlantSpec) -> None:
-    """Refuse joint positions (n,) rad outside the limits; `what` they are begins the message."""
-    limited = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
-    for joint, value, lower, upper in limited:
-        if not lower <= value <= upper:
-            wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
-            raise ConfigurationError(f"{what} must be {wanted}, got {value:g}")
 
 
 def _check_features(run: ResolvedRun, experiment: Experiment) -> None:

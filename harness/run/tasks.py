@@ -40,9 +40,10 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.robot.workspace import Workspace
 
-MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
+MAX_DRAWS: Final = 1000  # pairs of start and target; one in two fits
+DRAWN_AT_ONCE: Final = 4
 LONG_RUN: Final = 600.0  # [s]
-RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] of the curves on a UR5
+RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] radii of the curves on a UR5
 STRETCHED_START: Final = "singular_start"
 
 
@@ -159,9 +160,13 @@ class RandomTask(Task):
 
     def scaled(self, name: str, work: Workspace) -> Self:
         """See `Task.scaled`."""
-        lower, upper = numbers(work.lower), numbers(work.upper)
-        shortest, lowest = work.scale * self.shortest, work.scale * self.lowest
-        return replace(self, lower=lower, upper=upper, shortest=shortest, lowest=lowest)
+        return replace(
+            self,
+            lower=numbers(work.lower),
+            upper=numbers(work.upper),
+            shortest=work.scale * self.shortest,
+            lowest=work.scale * self.lowest,
+        )
 
 
 @settings
@@ -187,7 +192,8 @@ class CurveTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        centre, scale = as_array("its setting centre", self.centre, (setting.m,)), 1.0
+        centre = as_array("its setting centre", self.centre, (setting.m,))
+        scale = 1.0
         if setting.robot is not None:
             scale = setting.robot.workspace.scale
         radius = scale * RADII[self.curve] if self.radius is None else self.radius
@@ -262,11 +268,10 @@ def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, rob
     """Return whether a target (m,) that was taught before the camera's move is in easy reach after it."""
     if not isinstance(setting.moved, HandEyeModel):
         return True
-    point, (nearest, farthest) = setting.moved.to_base(target), robot.workspace.reach
-    return bool(
-        point[2] >= lowest
-        and nearest <= np.linalg.norm(point - robot.workspace.shoulder) <= farthest
-    )
+    point = setting.moved.to_base(target)
+    nearest, farthest = robot.workspace.reach
+    distance = np.linalg.norm(point - robot.workspace.shoulder)
+    return bool(point[2] >= lowest and nearest <= distance <= farthest)
 
 
 EXP1, EXP2, EXP3, EXP4 = (PointTask(start=start, target=target) for start, target in MOVES.values())
