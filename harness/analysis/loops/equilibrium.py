@@ -40,16 +40,19 @@ from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 Source: TypeAlias = Literal["true", "nominal", "estimated"]
-WARM_UP = 3.0  # [s] of a move after any probing, in which aids identify delay, response and noise
-SETTLING_PERIODS = 40  # of rest, after which histories and filters hold the rest only
+WARM_UP = 3.0  # [s] a move after any probing, in which aids identify delay, response and noise
+SETTLING_PERIODS = 40  # rest after which histories and filters hold nothing else
 PLANT = "kinematic"
 TASK = "random"
-OFFSET = 1e-4  # [m] of the desired feature in each axis, from which the motions begin
-WINDOWS = 4  # of the run; a stable one has a smaller error in the last than in the second, and than at the begin
-NEGLIGIBLE = 0.01  # [1] of the first error; rounding and slow learning may make a smaller one grow
-DURATION = 20.0  # [s]
+OFFSET = 1e-4  # [m] shift of the desired feature in each axis, which starts the motions
+# A run is cut into windows; a stable one has a smaller error in the last than in the second, and than at its start.
+WINDOWS = 4
+# An error below this share of the first one has died out; rounding and slow learning may make it grow again.
+SETTLED_ERROR_RATIO = 0.01  # [1]
+DURATION = 20.0  # [s] length of a simulated run
 MAX_LATENCY = 3.0  # [s] largest latency that is tried
-MAX_GAIN = 32.0  # largest factor that is tried
+MAX_GAIN = 32.0  # [1] largest factor that is tried
+# Settings of the plant that its linear model does not have
 LEFT_OUT = (
     "sensing.jitter",
     "sensing.latency_swing",
@@ -57,9 +60,9 @@ LEFT_OUT = (
     "mechanics.tool_frequency",
 )
 TIME_DIGITS = 9  # decimal places of a latency [s] that is tried
-STEP = 1e-6  # of a difference, in the unit of each number: a micrometre, a microradian
+DIFFERENCE_STEP = 1e-6  # in the unit of each number: a micrometre, a microradian
 RANK_TOLERANCE = 1e-6  # [1] a direction that is reached less than this counts as not reached
-PRECISION = 0.02  # [1] of the limit of the gain
+GAIN_PRECISION = 0.02  # [1] relative precision of the limit of the gain
 
 Linear = Callable[[FloatArray], FloatArray]
 
@@ -74,8 +77,9 @@ class FrozenEstimation:
 
     def __init__(self, estimation: Estimation, jacobian: JacobianFunction) -> None:
         """Take the stages, of which the pair stage goes on to remember joint positions, and the Jacobian."""
-        self.pairing, self._jacobian = estimation.pairing, jacobian
-        # of the Jacobian that was learned before
+        self.pairing = estimation.pairing
+        self._jacobian = jacobian
+        # The frame in which the Jacobian was learned before
         self.into_model_frame = estimation.into_model_frame
 
     def ahead(
@@ -101,7 +105,8 @@ class FrozenEstimation:
     ) -> EstimationState:
         """Return the state at an observation; see `Estimation.update`."""
         del desired
-        q, learned = observation.joint_position, state.learned
+        q = observation.joint_position
+        learned = state.learned
         jacobian, _ = self.ahead(state, q)
         if self.pairing is not None:
             learned = learned._replace(pair=self.pairing.advance(learned.pair, q, jacobian))
@@ -113,20 +118,21 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
 
     Of the past joint positions only those are kept that the present delay needs.
     """
-    other, pairing = copy.copy(servo), servo.estimation.pairing
-    learned = state.estimation.learned._replace(estimator=None, anchor=None)  # they may be large
+    other = copy.copy(servo)
     other.estimation = FrozenEstimation(servo.estimation, jacobian)  # type: ignore[assignment]
+    learned = state.estimation.learned._replace(estimator=None, anchor=None)  # they may be large
+    pairing = servo.estimation.pairing
     if pairing is not None:
         pair = learned.pair
-        other.predictor = (
-            None
-            if servo.predictor is None
-            else servo.predictor.frozen(float(pair.regression.share))
-        )
-        window = 0 if servo.predictor is None else servo.predictor.window
+        window = 0
+        if servo.predictor is not None:
+            other.predictor = servo.predictor.frozen(float(pair.regression.share))
+            window = servo.predictor.window
         rows = max(int(pairing.delay(pair)) + 4, window + 1)
-        learned = learned._replace(pair=pair._replace(past=pair.past[:rows]))
-    return other, state._replace(estimation=state.estimation._replace(learned=learned))
+        shorter = pair._replace(past=pair.past[:rows])
+        learned = learned._replace(pair=shorter)
+    estimation = state.estimation._replace(learned=learned)
+    return other, state._replace(estimation=estimation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +141,7 @@ class Rest:
 
     joint_position: FloatArray  # (n,) [rad]
     feature: FloatArray  # (m,), the measured and the desired one
-    time: float  # of the next step [s]
+    time: float  # time of the next step [s]
     preview: int  # future rows of the reference
 
     def observation(
@@ -156,39 +162,47 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
 
     Args:
         servo: of a single run.
-        state: at the rest, in which a step changes nothing that matters.
-        rest: where.
+        state: the servo's state at the rest, in which a step changes nothing that matters.
+        rest: the rest.
 
     Returns:
         A system with the inputs (m + n + m,) and the outputs u, (n,) rad/s. All rows of the reference move together.
     """
     packing = Packing(state)
-    m, n = len(rest.feature), len(rest.joint_position)
+    m = len(rest.feature)
+    n = len(rest.joint_position)
 
     def stepped(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-        measured = rest.observation(rest.feature + w[:, :m], rest.joint_position + w[:, m : m + n])
-        new, u = servo.step(
-            packing.unpack(x), measured, rest.reference(rest.feature + w[:, m + n :])
-        )
+        """Return x₊ = f(x, w) and u = g(x, w), a row each."""
+        feature = rest.feature + w[:, :m]
+        joint_position = rest.joint_position + w[:, m : m + n]
+        reference = rest.reference(rest.feature + w[:, m + n :])
+        measured = rest.observation(feature, joint_position)
+        new, u = servo.step(packing.unpack(x), measured, reference)
         return packing.pack(new, len(x)), u
 
     def differences(dx: FloatArray, dw: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives of x₊ and u along directions, a row each."""
+        # One call steps all runs side by side: first those in the directions, then those against them.
         size = len(dx)
-        x = packing.centre + STEP * np.vstack([dx, -dx])
-        new, u = stepped(x, STEP * np.vstack([dw, -dw]))
+        x = packing.centre + DIFFERENCE_STEP * np.vstack([dx, -dx])
+        w = DIFFERENCE_STEP * np.vstack([dw, -dw])
+        new, u = stepped(x, w)
         with np.errstate(invalid="ignore"):
-            change = np.nan_to_num(
-                (new[:size] - new[size:]) / (2.0 * STEP), nan=0.0, posinf=0.0, neginf=0.0
-            )
-        return change, (u[:size] - u[size:]) / (2.0 * STEP)
+            slope = (new[:size] - new[size:]) / (2.0 * DIFFERENCE_STEP)
+            # A number that is infinite in the state, such as an unset one, does not move.
+            slope = np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0)
+        return slope, (u[:size] - u[size:]) / (2.0 * DIFFERENCE_STEP)
 
     inputs = np.eye(2 * m + n)
-    B, D = differences(np.zeros((len(inputs), len(packing.centre))), inputs)
+    at_centre = np.zeros((len(inputs), len(packing.centre)))
+    B, D = differences(at_centre, inputs)
     shown = []
 
     def forward(directions: FloatArray) -> FloatArray:
-        new, u = differences(directions.T, np.zeros((directions.shape[1], len(inputs))))
+        """Return A times directions of x, (s, k), and note C times them."""
+        no_input = np.zeros((directions.shape[1], len(inputs)))
+        new, u = differences(directions.T, no_input)
         shown.append(u.T)
         return new.T
 
@@ -199,6 +213,7 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
 
 def observed(system: StateSpace) -> StateSpace:
     """Return a system without the states that its outputs never show."""
+    # What an output shows of (A, C) is what an input reaches of (Aᵀ, Cᵀ).
     basis, images = reached(lambda directions: system.A.T @ directions, system.C.T)
     return StateSpace(images.T @ basis, basis.T @ system.B, system.C @ basis, system.D)
 
@@ -210,8 +225,10 @@ def reached(image: Linear, first: FloatArray) -> tuple[FloatArray, FloatArray]:
         image: of directions (s, k) under A.
         first: (s, k).
     """
-    basis, images = np.zeros((len(first), 0)), np.zeros((len(first), 0))
-    candidates, scale = first, max(1.0, float(np.abs(first).max(initial=0.0)))
+    basis = np.zeros((len(first), 0))
+    images = np.zeros((len(first), 0))
+    scale = max(1.0, float(np.abs(first).max(initial=0.0)))
+    candidates = first
     while candidates.size:
         for _ in range(2):  # once more for the rounding of the first time
             candidates = candidates - basis @ (basis.T @ candidates)
@@ -221,7 +238,8 @@ def reached(image: Linear, first: FloatArray) -> tuple[FloatArray, FloatArray]:
         if new.shape[1] == 0:
             break
         candidates = image(new)
-        basis, images = np.hstack([basis, new]), np.hstack([images, candidates])
+        basis = np.hstack([basis, new])
+        images = np.hstack([images, candidates])
     return basis, images
 
 
@@ -241,23 +259,27 @@ class Packing:
             nonlocal place
             if not np.issubdtype(array.dtype, np.floating):
                 return np.broadcast_to(array, (len(x), *array.shape))
-            begin, place = place, place + array.size
-            return x[:, begin:place].reshape(len(x), *array.shape)
+            first = place
+            place += array.size
+            return x[:, first:place].reshape(len(x), *array.shape)
 
         return map_arrays(filled, self._state)
 
     def pack(self, state: ServoState, lanes: int) -> FloatArray:
         """Return the numbers of runs side by side, (lanes, s); with 0 lanes those of a single run, (1, s)."""
+        rows = max(lanes, 1)
         parts = []
 
         def noted(array: Any) -> Any:  # noqa: ANN401 - an array of any kind
             if np.issubdtype(array.dtype, np.floating):
-                lead = (lanes, *array.shape[1:]) if lanes else array.shape
-                parts.append(np.broadcast_to(array, lead).reshape(max(lanes, 1), -1))
+                shape = (lanes, *array.shape[1:]) if lanes else array.shape
+                parts.append(np.broadcast_to(array, shape).reshape(rows, -1))
             return array
 
         map_arrays(noted, state)
-        return np.hstack(parts) if parts else np.zeros((max(lanes, 1), 0))
+        if not parts:
+            return np.zeros((rows, 0))
+        return np.hstack(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,27 +295,34 @@ class Warm:
 
 
 def warm_up(resolved: ResolvedRun) -> Warm:
-    """Carry out the begin of a run on the kinematic plant, whose task is a move to a target at rest.
+    """Carry out the first seconds of a run on the kinematic plant, whose task is a move to a target at rest.
 
     Raises:
         ConfigurationError: a name or a setting that cannot be used.
         RunFault: the controller or the plant cannot go on.
     """
-    experiment, seed = build(resolved), resolved.request.seed
-    plant, controller, run = experiment.plant, experiment.controller, experiment.run
-    probing = controller.servo.initial.duration if isinstance(controller, ServoController) else 0
+    experiment = build(resolved)
+    plant = experiment.plant
+    controller = experiment.controller
+    run = experiment.run
+    probing = 0  # [periods]
+    if isinstance(controller, ServoController):
+        probing = controller.servo.initial.duration
     length = LoopSettings(probing + run.periods(WARM_UP), run.preview_rows)
-    rollout = begin(plant, controller, experiment.desired(length.periods), length, (seed, seed))
+    desired = experiment.desired(length.periods)
+    seed = resolved.request.seed
+    rollout = begin(plant, controller, desired, length, (seed, seed))
     for _ in periods(rollout, controller):
         pass
-    observation, truth, model = rollout.observation, plant.truth(), experiment.drawn.true
+    observation = rollout.observation
+    truth = plant.truth()
+    model = experiment.drawn.true
     if truth.jacobian is None or not isinstance(model, HandEyeModel):
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
     rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)
-    return Warm(
-        controller, model, find_robot(resolved.request.robot).nominal, rest, arm, resolved.plant
-    )
+    nominal = find_robot(resolved.request.robot).nominal
+    return Warm(controller, model, nominal, rest, arm, resolved.plant)
 
 
 def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> ArmModel:
@@ -328,22 +357,25 @@ def at_rest(warm: Warm, source: Source) -> tuple[Servo, ServoState, Rest]:
     Raises:
         TypeError: a controller that is not composed.
     """
-    controller, rest = warm.controller, warm.rest
+    controller = warm.controller
+    rest = warm.rest
     if not isinstance(controller, ServoController) or controller.state is None:
         raise TypeError(
             f"controller must be a ServoController after its warm-up, got {type(controller).__name__}"
         )
-    state, q = controller.state, rest.joint_position
-    J = {
+    q = rest.joint_position
+    jacobians = {
         "true": warm.arm.jacobian,
         "nominal": warm.nominal.jacobian(q),
-        "estimated": state.jacobian,
-    }[source]
-    servo, state = frozen(controller.servo, state, lambda _: J)
+        "estimated": controller.state.jacobian,
+    }
+    J = jacobians[source]
+    servo, state = frozen(controller.servo, controller.state, lambda _: J)
     reference = rest.reference(rest.feature)
     period = warm.arm.period
     for k in range(SETTLING_PERIODS):
-        state, _ = servo.step(state, rest.observation(rest.feature, q, k * period), reference)
+        observation = rest.observation(rest.feature, q, k * period)
+        state, _ = servo.step(state, observation, reference)
     return servo, state, replace(rest, time=rest.time + SETTLING_PERIODS * period)
 
 
@@ -357,16 +389,21 @@ class SmallLoop:
         """
         servo, state, self._rest = at_rest(warm, "true")
         self._servo, self._state = frozen(servo, state, warm.model.jacobian)
-        self._warm, self._period, self.latency = warm, warm.arm.period, warm.plant.sensing.latency
+        self._warm = warm
+        self._period = warm.arm.period
+        self.latency = warm.plant.sensing.latency
 
     def is_stable(self, factor: float = 1.0, latency: float | None = None) -> bool:
         """Return whether small motions die out with a factor on the command and another latency of the camera [s]."""
-        moved, rested = (self._features(factor, latency, offset) for offset in (OFFSET, 0.0))
+        moved = self._features(factor, latency, OFFSET)
+        rested = self._features(factor, latency, 0.0)
         errors = np.linalg.norm(moved - rested - OFFSET, axis=-1)
         length = len(errors) // WINDOWS
-        last = errors[-length:].max()
-        gone = last < NEGLIGIBLE * errors[0]
-        return bool(gone or last < min(errors[length : 2 * length].max(), errors[0]))
+        first = errors[0]
+        second_window = errors[length : 2 * length].max()
+        last_window = errors[-length:].max()
+        settled = last_window < SETTLED_ERROR_RATIO * first
+        return bool(settled or last_window < min(second_window, first))
 
     def latency_limit(self) -> float:
         """Return the largest latency, in whole periods more than that of the plant, before one that is unstable [s]."""
@@ -379,26 +416,30 @@ class SmallLoop:
 
     def gain_limit(self) -> float:
         """Return the factor on the command above which the loop is unstable, up to `MAX_GAIN`."""
-        stable, unstable = 1.0 / MAX_GAIN, MAX_GAIN
-        while unstable / stable > 1.0 + PRECISION:
+        # Bisection between factors, whose middle is their geometric mean
+        stable = 1.0 / MAX_GAIN
+        unstable = MAX_GAIN
+        while unstable / stable > 1.0 + GAIN_PRECISION:
             middle = float(np.sqrt(stable * unstable))
-            stable, unstable = (middle, unstable) if self.is_stable(middle) else (stable, middle)
+            if self.is_stable(middle):
+                stable = middle
+            else:
+                unstable = middle
         return float(np.sqrt(stable * unstable))
 
     def _features(self, factor: float, latency: float | None, offset: float) -> FloatArray:
         """Return the true feature in each period, (periods, m), with the desired one moved by an offset [m]."""
-        rest, late = self._rest, self.latency if latency is None else latency
-        sensing = replace(
-            without_disturbance(self._warm.plant.sensing), latency=round(late, TIME_DIGITS)
-        )
+        rest = self._rest
+        late = self.latency if latency is None else latency
+        quiet = without_disturbance(self._warm.plant.sensing)
+        sensing = replace(quiet, latency=round(late, TIME_DIGITS))
         setup = PlantSetup(self._warm.model, rest.joint_position, self._period)
         plant = build_kinematic(replace(self._warm.plant, sensing=sensing), setup)
-        count = round(DURATION / self._period)
-        desired = np.broadcast_to(
-            rest.feature + offset, (count + 1 + rest.preview, len(rest.feature))
-        )
+        length = LoopSettings(round(DURATION / self._period) + 1, rest.preview)
+        rows = length.periods + rest.preview
+        desired = np.broadcast_to(rest.feature + offset, (rows, len(rest.feature)))
         controller = _FrozenController(self._servo, self._state, rest, factor)
-        rollout = Rollout(plant, plant.reset(0), desired, LoopSettings(count + 1, rest.preview))
+        rollout = Rollout(plant, plant.reset(0), desired, length)
         features = np.array([period.truth.feature for period in periods(rollout, controller)])
         plant.close()
         return features[1:]
@@ -409,7 +450,10 @@ class _FrozenController(Controller):
     """A frozen servo after its rest, whose command is multiplied by a factor."""
 
     def __init__(self, servo: Servo, state: ServoState, rest: Rest, factor: float) -> None:
-        self._servo, self._state, self._rest, self._factor = servo, state, rest, factor
+        self._servo = servo
+        self._state = state
+        self._rest = rest
+        self._factor = factor
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Keep the state of the rest."""

@@ -26,6 +26,7 @@ from servobench.harness.analysis.loops.equilibrium import (
     TASK,
     Rest,
     Source,
+    Warm,
     at_rest,
     linearise,
     warm_up,
@@ -56,14 +57,14 @@ from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch
 
 AnyConfig: TypeAlias = Any  # settings of any composed controller
-LENGTH = 256  # [periods] of the multisine
+LENGTH = 256  # [periods] length of the multisine
 AMPLITUDE = 2e-4  # [m] and [rad] root mean square of the multisine
-SETTLING = 100  # [periods] of rest before the experiments
+SETTLING = 100  # [periods] rest before the experiments
 MAX_MOTION = 0.1  # [m] beyond it a loop is not at small motions any more
-STEP_DURATION = 4.0  # [s] of the step responses
-FAST_POINTS = 150  # of the frequency axis where only the delay margin is wanted
+STEP_DURATION = 4.0  # [s] length of the step responses
+FAST_POINTS = 150  # frequencies where only the delay margin is wanted
 # Heading in a terminal -> column, factor, digits
-SHOWN: Final = {
+MARGIN_COLUMNS: Final = {
     "gain\nmargin": ("gain_margin", 1.0, 2),
     "phase\nmargin, °": ("phase_margin_deg", 1.0, 0),
     "delay\nmargin, ms": ("delay_margin_s", 1000.0, 0),
@@ -72,7 +73,7 @@ SHOWN: Final = {
     "over-\nshoot, %": ("overshoot", 100.0, 0),
 }
 # The same where limits were simulated, too
-SIMULATED: Final = {
+SIMULATED_COLUMNS: Final = {
     "gain\nmargin": ("gain_margin", 1.0, 2),
     "gain,\nsimulated": ("simulated_gain_margin", 1.0, 2),
     "latency\nlimit, ms": ("latency_limit_s", 1000.0, 0),
@@ -102,9 +103,12 @@ class LinearArm(Plant):
 
     def __init__(self, arm: ArmModel, rest: Rest) -> None:
         """Begin at the rest."""
-        self._system, self._period, self._rest = arm.matrices(), arm.period, rest
+        self._system = arm.matrices()
+        self._period = arm.period
+        self._rest = rest
         self._m = len(arm.jacobian)
-        self._x, self._k = np.zeros(len(self._system.A)), 0
+        self._x = np.zeros(len(self._system.A))
+        self._k = 0
 
     def excite(self, added: FloatArray) -> Observation:
         """Add signals to the measurements from now on, (periods, m + n) m and rad, and return the present observation.
@@ -112,7 +116,8 @@ class LinearArm(Plant):
         Raises:
             ControllerDiverged: the loop is not stable.
         """
-        self._added, self.measured = added, list[FloatArray]()
+        self._added = added
+        self.measured: list[FloatArray] = []
         return self._observe()
 
     def reset(self, seed: int) -> Observation:
@@ -131,22 +136,27 @@ class LinearArm(Plant):
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
-        return Truth(self._rest.feature + (self._system.C @ self._x)[: self._m], None)
+        deviation = self._system.C @ self._x
+        return Truth(self._rest.feature + deviation[: self._m], None)
 
     def close(self) -> None:
         """See `Plant.close`; nothing is held."""
 
     def _observe(self) -> Observation:
-        deviation, row, rest, m = self._system.C @ self._x, len(self.measured), self._rest, self._m
+        m = self._m
+        rest = self._rest
+        deviation = self._system.C @ self._x
+        row = len(self.measured)
         if row < len(self._added):
             deviation = deviation + self._added[row]
-            if not np.abs(deviation[:m]).max() < MAX_MOTION:
+            if not np.abs(deviation[:m]).max() < MAX_MOTION:  # NaN counts as unstable, too
                 raise ControllerDiverged(
                     f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions"
                 )
             self.measured.append(deviation)
         time = rest.time + self._k * self._period
-        return Observation(time, rest.joint_position + deviation[m:], rest.feature + deviation[:m])
+        joint_position = rest.joint_position + deviation[m:]
+        return Observation(time, joint_position, rest.feature + deviation[:m])
 
 
 class SmallMotions:
@@ -158,7 +168,9 @@ class SmallMotions:
         Raises:
             ControllerDiverged: the loop is not stable.
         """
-        self._controller, self._rest, self._arm = controller, rest, LinearArm(arm, rest)
+        self._controller = controller
+        self._rest = rest
+        self._arm = LinearArm(arm, rest)
         self.run(np.zeros((SETTLING, sum(arm.jacobian.shape))))
 
     def run(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
@@ -171,11 +183,12 @@ class SmallMotions:
         Raises:
             ControllerDiverged: the loop is not stable.
         """
-        wanted = self._rest.feature if desired is None else self._rest.feature + desired
+        wanted = self._rest.feature
+        if desired is not None:
+            wanted = wanted + desired
+        length = LoopSettings(len(added), self._rest.preview)
         rows = np.tile(wanted, (len(added) + self._rest.preview + 1, 1))
-        rollout = Rollout(
-            self._arm, self._arm.excite(added), rows, LoopSettings(len(added), self._rest.preview)
-        )
+        rollout = Rollout(self._arm, self._arm.excite(added), rows, length)
         command = [period.command.joint_velocity for period in periods(rollout, self._controller)]
         return Record(np.array(self._arm.measured), np.array(command))
 
@@ -190,29 +203,39 @@ class SmallMotions:
 
 def multisine(length: int) -> FloatArray:
     """Return one period of equal sines at all harmonics with Schroeder's phases, (length,), without a mean."""
-    harmonics = np.arange(1, length // 2 + 1)
+    k = np.arange(1, length // 2 + 1)
     spectrum = np.zeros(length // 2 + 1, dtype=np.complex128)
-    spectrum[1:] = np.exp(-1j * np.pi * harmonics * (harmonics - 1) / len(harmonics))
+    # Schroeder's phases, −π k(k − 1)/K, keep the peak of the sum low.
+    spectrum[1:] = np.exp(-1j * np.pi * k * (k - 1) / len(k))
     spectrum[-1] = 1.0  # real at the Nyquist frequency
     signal = np.fft.irfft(spectrum, length)
-    return np.asarray(AMPLITUDE * signal / np.sqrt(np.mean(signal**2)))
+    root_mean_square = np.sqrt(np.mean(signal**2))
+    return np.asarray(AMPLITUDE * signal / root_mean_square)
 
 
 def excite(loop: SmallMotions, inputs: int, length: int = LENGTH) -> list[Record]:
     """Return an experiment for each of the signals that the controller measures: its second period, less the rest."""
     signal = np.tile(multisine(length), 2)
     rest = loop.tried(np.zeros((len(signal), inputs)))
-    excited = [loop.tried(np.outer(signal, each)) for each in np.eye(inputs)]
-    return [Record(each.measured[length:] - rest.measured[length:], each.command[length:] - rest.command[length:])
-            for each in excited]  # fmt: skip
+    records = []
+    for direction in np.eye(inputs):
+        excited = loop.tried(np.outer(signal, direction))
+        # Transients have died out in the second period; what moves without excitation is no response.
+        measured = excited.measured[length:] - rest.measured[length:]
+        command = excited.command[length:] - rest.command[length:]
+        records.append(Record(measured, command))
+    return records
 
 
 def step_responses(loop: SmallMotions, m: int, n: int, periods: int) -> FloatArray:
     """Return each feature after a unit step of its own reference, (periods, m), measured in small motions."""
     nothing = np.zeros((periods, m + n))
     rest = loop.tried(nothing).measured
-    moved = [loop.tried(nothing, AMPLITUDE * each).measured for each in np.eye(m)]
-    return np.stack([(each - rest)[:, i] / AMPLITUDE for i, each in enumerate(moved)], axis=-1)
+    steps = []
+    for i, axis in enumerate(np.eye(m)):
+        moved = loop.tried(nothing, AMPLITUDE * axis).measured
+        steps.append((moved - rest)[:, i] / AMPLITUDE)
+    return np.stack(steps, axis=-1)
 
 
 def controller_response(records: list[Record], period: float) -> tuple[FloatArray, ComplexArray]:
@@ -222,12 +245,20 @@ def controller_response(records: list[Record], period: float) -> tuple[FloatArra
         records: as many experiments as the controller measures signals, each one whole period of its excitation.
         period: of sampling [s].
     """
-    V = np.stack([np.fft.rfft(record.measured, axis=0)[1:] for record in records], axis=-1)
-    U = np.stack([np.fft.rfft(record.command, axis=0)[1:] for record in records], axis=-1)
+    V = _spectra([record.measured for record in records])
+    U = _spectra([record.command for record in records])
+    # C V = U, solved as Vᵀ Cᵀ = Uᵀ
+    transposed = np.linalg.solve(np.swapaxes(V, -1, -2), np.swapaxes(U, -1, -2))
+    response = np.swapaxes(transposed, -1, -2)
     length = len(records[0].measured)
-    frequency = 2.0 * np.pi * np.arange(1, length // 2 + 1) / (length * period)
-    response = np.linalg.solve(np.swapaxes(V, -1, -2), np.swapaxes(U, -1, -2))
-    return np.asarray(frequency, np.float64), np.asarray(np.swapaxes(response, -1, -2))
+    harmonics = np.arange(1, length // 2 + 1)
+    frequency = 2.0 * np.pi * harmonics / (length * period)
+    return np.asarray(frequency, np.float64), np.asarray(response)
+
+
+def _spectra(signals: list[FloatArray]) -> ComplexArray:
+    """Return the spectra of signals, (periods, c) each, without their means: (k, c, signals)."""
+    return np.stack([np.fft.rfft(signal, axis=0)[1:] for signal in signals], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,21 +280,25 @@ class LoopAnalysis:
     @property
     def latency_limit(self) -> float:
         """The largest latency of the camera at which the loop is predicted to be stable [s]; 0 if it is not now."""
-        return self.arm.latency + self.margins.delay_margin_s if self.stable else 0.0
+        if not self.stable:
+            return 0.0
+        return self.arm.latency + self.margins.delay_margin_s
 
     def gain_limits(self, latencies: Sequence[float]) -> FloatArray:
         """Return the least factor on the command at which the loop becomes unstable, at each latency [s]."""
-        at = [replace(self.response, arm=replace(self.arm, latency=each)) for each in latencies]
-        return np.array([each.gain_limit() for each in at])
+        limits = []
+        for latency in latencies:
+            later = replace(self.arm, latency=latency)
+            limits.append(replace(self.response, arm=later).gain_limit())
+        return np.array(limits)
 
     def sensitivity_peaks(self, factors: FloatArray, latencies: Sequence[float]) -> FloatArray:
         """Return M_s with the command multiplied by each factor, at each latency [s], (factors, latencies)."""
         peaks = np.full((len(factors), len(latencies)), np.inf)
         every = max(1, len(self.response.frequency) // 128)
-        frequency, controller = (
-            self.response.frequency[::-every][::-1],
-            self.response.controller[::-every][::-1],
-        )
+        # Thinned from the upper end, so that the Nyquist frequency stays.
+        frequency = self.response.frequency[::-every][::-1]
+        controller = self.response.controller[::-every][::-1]
         limits = self.gain_limits(latencies)
         for j, latency in enumerate(latencies):
             arm = replace(self.arm, latency=latency)
@@ -279,7 +314,7 @@ def analyse_loop(
     """Analyse the loop of a controller on the kinematic plant.
 
     Args:
-        resolved: the run whose begin warms the controller up.
+        resolved: the run whose first seconds warm the controller up.
         source: the Jacobian at which the estimator of a composed controller is frozen.
         identify: identify a composed controller as any other, from logged data, while its estimator goes on learning.
 
@@ -288,27 +323,46 @@ def analyse_loop(
         RunFault: the controller cannot go on, or an unstable loop whose controller has to be identified.
     """
     with one_thread():
-        warm, name = warm_up(resolved), resolved.request.controller
-        arm, (m, n) = warm.arm, warm.arm.jacobian.shape
-        steps = round(STEP_DURATION / arm.period)
+        warm = warm_up(resolved)
+        name = resolved.request.controller
         if isinstance(warm.controller, ServoController) and not identify:
-            controller = linearise(*at_rest(warm, source))
-            closed, response = (
-                closed_loop(arm.matrices(), controller),
-                linear_response(controller, arm),
-            )
-            stable, step = is_stable(closed.A), closed.step(m, arm.period, steps)
-            return LoopAnalysis(name, "linearised", stable, response.margins(), response, step)
-        loop = SmallMotions(warm.controller, arm, warm.rest)
-        response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)
-        return LoopAnalysis(
-            name,
-            "identified",
-            True,
-            response.margins(),
-            response,
-            step_responses(loop, m, n, steps),
-        )
+            return _linearised(name, warm, source)
+        return _identified(name, warm)
+
+
+def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
+    """Return the loop of a composed controller, linearised with a frozen estimator."""
+    arm = warm.arm
+    controller = linearise(*at_rest(warm, source))
+    closed = closed_loop(arm.matrices(), controller)
+    response = linear_response(controller, arm)
+    steps = round(STEP_DURATION / arm.period)
+    return LoopAnalysis(
+        name=name,
+        model="linearised",
+        stable=is_stable(closed.A),
+        margins=response.margins(),
+        response=response,
+        step=closed.step(len(arm.jacobian), arm.period, steps),
+    )
+
+
+def _identified(name: str, warm: Warm) -> LoopAnalysis:
+    """Return the loop of any controller, identified from logged data."""
+    arm = warm.arm
+    m, n = arm.jacobian.shape
+    loop = SmallMotions(warm.controller, arm, warm.rest)
+    frequency, controller = controller_response(excite(loop, m + n), arm.period)
+    response = LoopResponse(frequency, controller, arm)
+    steps = round(STEP_DURATION / arm.period)
+    return LoopAnalysis(
+        name=name,
+        model="identified",
+        stable=True,  # an unstable one has ended the experiments
+        margins=response.margins(),
+        response=response,
+        step=step_responses(loop, m, n, steps),
+    )
 
 
 def delay_margin(
@@ -318,10 +372,10 @@ def delay_margin(
     plant: KinematicConfig | None = None,
     robot: str = DEFAULT_ROBOT,
 ) -> float:
-    """Return by how much later the camera may be before the loop of a composed controller is unstable, s.
+    """Return the further latency of the camera at which the loop of a composed controller becomes unstable [s].
 
-    The estimator is frozen at the true Jacobian of the nominal robot, where a move of the warm-up ended. It takes 20 ms
-    without aids, 100 to 200 ms with all of them.
+    The estimator is frozen at the true Jacobian of the nominal robot, where a move of the warm-up ended. A call takes
+    20 ms for a controller without aids, 100 to 200 ms for one with all of them.
 
     Args:
         config: settings of the controller.
@@ -373,38 +427,41 @@ def latency_border(
     """
     border = 0.0
     for latency in latencies:
-        later = replace(plant, sensing=replace(plant.sensing, latency=latency))
-        margin = delay_margin(config, name, run, later, robot)
+        sensing = replace(plant.sensing, latency=latency)
+        margin = delay_margin(config, name, run, replace(plant, sensing=sensing), robot)
         if margin == 0.0:
             return min(border, latency)
         border = latency + margin
-    return border if border <= latencies[-1] else np.inf
+    if border > latencies[-1]:
+        return np.inf
+    return border
 
 
 def linear_response(controller: StateSpace, arm: ArmModel, points: int = POINTS) -> LoopResponse:
-    """Return the frequency response of a linear controller on an arm, at so many points."""
-    axis, measured = frequencies(arm.period, points), sum(arm.jacobian.shape)
-    return LoopResponse(
-        axis, controller.response(np.exp(1j * axis * arm.period))[:, :, :measured], arm
-    )
+    """Return the frequency response of a linear controller on an arm, at a number of frequencies."""
+    axis = frequencies(arm.period, points)
+    response = controller.response(np.exp(1j * axis * arm.period))
+    measured = sum(arm.jacobian.shape)  # inputs before the references
+    return LoopResponse(axis, response[:, :, :measured], arm)
 
 
 def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
     """Return a row for each loop; margins of a loop that is unstable are NaN, its limits 0."""
     rows = []
     for loop in loops:
-        numbers = asdict(loop.margins) | {"overshoot": max(0.0, float(loop.step.max()) - 1.0)}
-        known = numbers if loop.stable else dict.fromkeys(numbers, np.nan)
-        rows.append(
-            {"controller": loop.name, "model": loop.model, "stable": loop.stable, **known,
-             "latency_limit_s": loop.latency_limit}
-        )  # fmt: skip
+        numbers = asdict(loop.margins)
+        numbers["overshoot"] = max(0.0, float(loop.step.max()) - 1.0)
+        if not loop.stable:
+            numbers = dict.fromkeys(numbers, np.nan)
+        row = {"controller": loop.name, "model": loop.model, "stable": loop.stable}
+        rows.append({**row, **numbers, "latency_limit_s": loop.latency_limit})
     return pd.DataFrame(rows)
 
 
 def printed(table: pd.DataFrame) -> pd.DataFrame:
     """Return the table as text for a terminal."""
-    shown = SIMULATED if "simulated_gain_margin" in table else SHOWN
-    text = {head: [number(factor * value, f".{digits}f") for value in table[name]]
-            for head, (name, factor, digits) in shown.items()}  # fmt: skip
-    return pd.DataFrame({"controller": table["controller"], **text})
+    columns = SIMULATED_COLUMNS if "simulated_gain_margin" in table else MARGIN_COLUMNS
+    text: dict[str, Any] = {"controller": table["controller"]}
+    for heading, (name, factor, digits) in columns.items():
+        text[heading] = [number(factor * value, f".{digits}f") for value in table[name]]
+    return pd.DataFrame(text)

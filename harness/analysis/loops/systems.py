@@ -34,13 +34,12 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import discretise_lag
 
 ComplexArray = npt.NDArray[np.complex128]
-STABILITY_TOLERANCE = (
-    1e-4  # [1] of a pole's modulus above 1, which neutral modes have by rounding of differences
-)
+# A pole's modulus may exceed 1 by this: neutral modes do, by the rounding of differences.
+STABILITY_TOLERANCE = 1e-4  # [1]
 MIN_FREQUENCY = 1e-3  # [1] lowest frequency, as a share of the Nyquist frequency
-POINTS = 400  # of the frequency axis
-NEGLIGIBLE = 1e-6  # [1] a locus that stays below this never matters
-WHOLE = 1e-9  # [1] a share of a period below which a delay is a whole number of periods
+POINTS = 400  # number of frequencies on the axis
+NEGLIGIBLE_LOCUS = 1e-6  # [1] a locus that stays below this never matters
+WHOLE_PERIOD_TOLERANCE = 1e-9  # [1] share of a period within which a delay counts as whole periods
 
 
 class StateSpace(NamedTuple):
@@ -53,20 +52,21 @@ class StateSpace(NamedTuple):
 
     def response(self, z: ComplexArray) -> ComplexArray:
         """Return C (zI − A)⁻¹ B + D, (k, outputs, inputs), at the points z, (k,), of the complex plane."""
-        resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
-        return np.asarray(
-            self.C @ np.linalg.solve(resolvent, self.B.astype(np.complex128)) + self.D
-        )
+        pencil = z[:, None, None] * np.eye(len(self.A)) - self.A  # zI − A
+        states = np.linalg.solve(pencil, self.B.astype(np.complex128))
+        return np.asarray(self.C @ states + self.D)
 
     def step(self, outputs: int, period: float, periods: int) -> FloatArray:
         """Return each of the first outputs after a unit step of the input with its number, (periods, outputs)."""
         import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
 
-        system, times = control.ss(*self, period), np.arange(periods) * period
-        steps = [
-            control.step_response(system, times, input=i, output=i).outputs for i in range(outputs)
-        ]
-        return np.stack([np.ravel(step) for step in steps], axis=-1)
+        system = control.ss(*self, period)
+        times = np.arange(periods) * period
+        steps = []
+        for i in range(outputs):
+            response = control.step_response(system, times, input=i, output=i)
+            steps.append(np.ravel(response.outputs))
+        return np.stack(steps, axis=-1)
 
 
 def closed_loop(plant: StateSpace, controller: StateSpace) -> StateSpace:
@@ -80,17 +80,18 @@ def closed_loop(plant: StateSpace, controller: StateSpace) -> StateSpace:
         From the references to the measured signals; the states are those of the plant, then the controller's.
     """
     measured = len(plant.C)
-    B, D = controller.B, controller.D
-    by_plant, by_law = D[:, :measured] @ plant.C, controller.C
-    A = np.block(
-        [
-            [plant.A + plant.B @ by_plant, plant.B @ by_law],
-            [B[:, :measured] @ plant.C, controller.A],
-        ]
-    )
-    references = np.vstack([plant.B @ D[:, measured:], B[:, measured:]])
+    # The controller's inputs are the measured signals and then the references.
+    B_y = controller.B[:, :measured]
+    B_r = controller.B[:, measured:]
+    D_y = controller.D[:, :measured]
+    D_r = controller.D[:, measured:]
+    by_plant = D_y @ plant.C  # u from the plant's states
+    plant_rows = [plant.A + plant.B @ by_plant, plant.B @ controller.C]
+    controller_rows = [B_y @ plant.C, controller.A]
+    A = np.block([plant_rows, controller_rows])
+    B = np.vstack([plant.B @ D_r, B_r])
     C = np.hstack([plant.C, np.zeros((measured, len(controller.A)))])
-    return StateSpace(A, references, C, np.zeros((measured, references.shape[1])))
+    return StateSpace(A, B, C, np.zeros((measured, B.shape[1])))
 
 
 def is_stable(A: FloatArray) -> bool:
@@ -111,16 +112,22 @@ class ArmModel:
 
     def matrices(self) -> StateSpace:
         """Return the system from u, (n,) rad/s, to deviations of measured feature and joint positions, (m + n,)."""
-        joint, (m, n) = self._joint(), self.jacobian.shape
-        # Numbers of the frames under way
-        waiting = split(self.latency + self.age, self.period)[0] * m
-        joints, B, positions = (
-            np.kron(each, np.eye(n)) for each in (joint.A, joint.B, joint.C[1:])
-        )
-        # Exposed now, then under way
-        frames = block_diag(np.kron(joint.C[:1], self.jacobian), np.eye(waiting))
-        A = np.vstack([np.pad(joints, ((0, 0), (0, waiting))), frames[:waiting]])
-        C = np.vstack([frames[waiting:], np.pad(positions, ((0, 0), (0, waiting)))])
+        joint = self._joint()
+        m, n = self.jacobian.shape
+        every_joint = np.eye(n)
+        joints = np.kron(joint.A, every_joint)
+        B = np.kron(joint.B, every_joint)
+        positions = np.kron(joint.C[1:], every_joint)
+        exposed = np.kron(joint.C[:1], self.jacobian)
+        # States behind those of the joints: the numbers of the frames under way, the newest first. The rows of `frames`
+        # are the feature exposed now and these; all but the last frame wait on, the last one is measured.
+        late, _ = split(self.latency + self.age, self.period)
+        waiting = late * m
+        frames = block_diag(exposed, np.eye(waiting))
+        no_frames = ((0, 0), (0, waiting))
+        A = np.vstack([np.pad(joints, no_frames), frames[:waiting]])
+
+        C = np.vstack([frames[waiting:], np.pad(positions, no_frames)])
         return StateSpace(A, np.pad(B, ((0, waiting), (0, 0))), C, np.zeros((m + n, n)))
 
     def response(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -139,16 +146,17 @@ class ArmModel:
         _, early = split(self.latency + self.age, self.period)
         queue = waiting + (part > 0.0)
         every = np.eye(3 + queue + (early > 0.0))  # a row for each state, and the last one for u(k)
-        position, motion, commands = (
-            every[0],
-            every[:2],
-            np.vstack([every[-1], every[2 : 2 + queue]]),
-        )
+        position = every[0]
+        motion = every[:2]
+        commands = np.vstack([every[-1], every[2 : 2 + queue]])  # u(k), u(k−1), …
 
         def after(time: float) -> FloatArray:
             """Return q and v `time` [s] into the period, of which the command of the period before has its part."""
-            state, before = motion, min(time, part)
-            for span, command in ((before, commands[-1]), (time - before, commands[waiting])):
+            before = min(time, part)
+            older = (before, commands[-1])
+            newer = (time - before, commands[waiting])
+            state = motion
+            for span, command in (older, newer):
                 if span > 0.0:
                     A, b = discretise_lag(self.lag, span)
                     state = A @ state + np.outer(b, command)
@@ -160,18 +168,19 @@ class ArmModel:
             rows.append(after(self.period - early)[:1])
             exposed = every[-2]
         new = np.vstack(rows)
-        return StateSpace(
-            new[:, :-1], new[:, -1:], np.vstack([exposed, position])[:, :-1], np.zeros((2, 1))
-        )
+        shown = np.vstack([exposed, position])
+        # The last column belongs to u(k), which is the input and no state.
+        return StateSpace(new[:, :-1], new[:, -1:], shown[:, :-1], np.zeros((2, 1)))
 
 
 def split(delay: float, period: float) -> tuple[int, float]:
     """Return a delay [s] as whole periods and the rest [s]."""
     periods = delay / period
     whole = round(periods)
-    if abs(periods - whole) < WHOLE:
+    if abs(periods - whole) < WHOLE_PERIOD_TOLERANCE:
         return whole, 0.0
-    return int(periods), delay - int(periods) * period
+    complete = int(periods)
+    return complete, delay - complete * period
 
 
 @dataclass(frozen=True)
@@ -179,10 +188,8 @@ class Margins:
     """The margins of a loop, by their columns in the table of loops."""
 
     gain_margin: float  # the factor on the command above 1 at which the loop becomes unstable; inf if there is none
-    gain_reduction_margin: (
-        float  # the factor below 1 at which it becomes unstable; 0 if there is none
-    )
-    phase_margin_deg: float  # of all features together; inf where no locus crosses the unit circle
+    gain_reduction_margin: float  # the factor below 1 at which it becomes unstable; 0 for none
+    phase_margin_deg: float  # for all features together; inf where no locus crosses the unit circle
     delay_margin_s: float  # additional latency of the camera at which the loop becomes unstable; inf if there is none
     crossover_rad_s: float  # largest frequency at which a locus at the feature crosses the unit circle; 0 if none
     sensitivity_peak: float  # M_s, at the feature [1]
@@ -212,49 +219,74 @@ class LoopResponse:
 
     def at_command(self) -> ComplexArray:
         """Return L broken at the command, (k, n, n)."""
-        J, (exposed, joints) = self.arm.jacobian, self.arm.response(self.z)
+        J = self.arm.jacobian
         m = len(J)
-        by_feature = exposed[:, None, None] * (self.controller[:, :, :m] @ J)
-        return -by_feature - joints[:, None, None] * self.controller[:, :, m:]
+        exposed, joints = self.arm.response(self.z)
+        from_feature = self.controller[:, :, :m]
+        from_joints = self.controller[:, :, m:]
+        by_feature = exposed[:, None, None] * (from_feature @ J)
+        by_joints = joints[:, None, None] * from_joints
+        return -by_feature - by_joints
 
     def at_feature(self) -> ComplexArray:
         """Return L broken at the measured feature, (k, m, m), with the joint positions fed back."""
-        J, (exposed, joints) = self.arm.jacobian, self.arm.response(self.z)
+        J = self.arm.jacobian
         m, n = J.shape
-        inner = np.eye(n) - joints[:, None, None] * self.controller[:, :, m:]
-        command = np.linalg.solve(inner, self.controller[:, :, :m])
+        exposed, joints = self.arm.response(self.z)
+        from_feature = self.controller[:, :, :m]
+        from_joints = self.controller[:, :, m:]
+        inner = np.eye(n) - joints[:, None, None] * from_joints  # the loop over joint positions
+        command = np.linalg.solve(inner, from_feature)
         return np.asarray(-exposed[:, None, None] * (J @ command))
 
     def margins(self) -> Margins:
         """Return the margins: of the gain at the command, of the rest at the measured feature."""
-        gain, L = gain_crossings(self.at_command()), self.at_feature()
+        gain = gain_crossings(self.at_command())
+        L = self.at_feature()
         phase, where = phase_crossings(L, self.frequency)
+        # Real loops have the conjugate locus at −ω, which is as far from −1 the other way round.
+        least_phase = np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf)
         S = sensitivity(L)
-        every = np.eye(S.shape[-1])
+        one = np.eye(S.shape[-1])
+        T = one - S
+        mean = S - one / 2.0  # (S − T)/2
         return Margins(
-            gain_margin=float(gain[gain >= 1.0].min(initial=np.inf)),
-            gain_reduction_margin=float(gain[gain < 1.0].max(initial=0.0)),
-            phase_margin_deg=float(
-                np.rad2deg(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf))
-            ),
-            delay_margin_s=float((phase / where).min(initial=np.inf)),
-            crossover_rad_s=float(where.max(initial=0.0)),
-            sensitivity_peak=float(largest_gain(S).max()),
-            complementary_peak=float(largest_gain(every - S).max()),
-            disk_margin=1.0 / float(largest_gain(S - every / 2.0).max()),
+            gain_margin=_least(gain[gain >= 1.0]),
+            gain_reduction_margin=_greatest(gain[gain < 1.0]),
+            phase_margin_deg=float(np.rad2deg(least_phase)),
+            delay_margin_s=_least(phase / where),
+            crossover_rad_s=_greatest(where),
+            sensitivity_peak=_peak(S),
+            complementary_peak=_peak(T),
+            disk_margin=1.0 / _peak(mean),
         )
 
     def delay_margin(self) -> float:
         """Return the additional latency at which the loop becomes unstable [s], inf if there is none."""
         phase, where = phase_crossings(self.at_feature(), self.frequency)
-        return float((phase / where).min(initial=np.inf))
+        return _least(phase / where)
 
     def gain_limit(self) -> float:
         """Return the least factor on the command at which the loop becomes unstable, inf if there is none.
 
         For a loop that is stable at small gains, whether or not it is at the present one.
         """
-        return float(gain_crossings(self.at_command()).min(initial=np.inf))
+        return _least(gain_crossings(self.at_command()))
+
+
+def _least(values: FloatArray) -> float:
+    """Return the least of some values, inf if there is none."""
+    return float(values.min(initial=np.inf))
+
+
+def _greatest(values: FloatArray) -> float:
+    """Return the greatest of some values above 0, 0 if there is none."""
+    return float(values.max(initial=0.0))
+
+
+def _peak(response: ComplexArray) -> float:
+    """Return the largest singular value over all frequencies."""
+    return float(largest_gain(response).max())
 
 
 def sensitivity(L: ComplexArray) -> ComplexArray:
@@ -271,20 +303,25 @@ def loci(L: ComplexArray) -> ComplexArray:
     """Return the eigenvalues of L, (k, c, c), ordered so that each column, (k, c), is one smooth curve."""
     values = np.linalg.eigvals(L)
     for before, now in pairwise(values):
-        _, order = linear_sum_assignment(np.abs(before[:, None] - now[None, :]))
-        now[:] = now[order]
+        distance = np.abs(before[:, None] - now[None, :])
+        _, order = linear_sum_assignment(distance)
+        now[:] = now[order]  # in place: the next pair starts from this order
     return np.asarray(values)
 
 
 def gain_crossings(L: ComplexArray) -> FloatArray:
     """Return the factors at which a locus passes −1, (crossings,)."""
     values = _relevant(loci(L))
-    before, after = values[:-1], values[1:]
-    crosses = (np.sign(before.imag) != np.sign(after.imag)) & (before.imag != after.imag)
-    share = before.imag[crosses] / (before.imag[crosses] - after.imag[crosses])
-    real = before.real[crosses] + share * (after.real[crosses] - before.real[crosses])
+    imag = values.imag
+    changes_sign = np.sign(imag[:-1]) != np.sign(imag[1:])
+    crosses = changes_sign & (imag[:-1] != imag[1:])
+    before = values[:-1][crosses]
+    after = values[1:][crosses]
+    # The locus is a straight line between two frequencies: it crosses the real axis after this share of it.
+    share = before.imag / (before.imag - after.imag)
+    real = before.real + share * (after.real - before.real)
     last = values[-1]  # at the Nyquist frequency the loci are real
-    ends = last.real[np.abs(last.imag) <= NEGLIGIBLE * np.abs(last)]
+    ends = last.real[np.abs(last.imag) <= NEGLIGIBLE_LOCUS * np.abs(last)]
     real = np.concatenate([real, ends])
     return -1.0 / real[real < 0.0]
 
@@ -294,17 +331,20 @@ def phase_crossings(L: ComplexArray, frequency: FloatArray) -> tuple[FloatArray,
     values = _relevant(loci(L))
     level = np.log(np.abs(values))
     crosses = np.sign(level[:-1]) != np.sign(level[1:])
-    share = level[:-1][crosses] / (level[:-1][crosses] - level[1:][crosses])
+    level_before = level[:-1][crosses]
+    level_after = level[1:][crosses]
+    # Between two frequencies log |λ|, arg λ and log ω are taken as linear.
+    share = level_before / (level_before - level_after)
+    before = values[:-1][crosses]
+    after = values[1:][crosses]
+    turn = np.angle(after / before)
+    phase = np.mod(np.angle(before) + share * turn + np.pi, 2.0 * np.pi)
     row, _ = np.nonzero(crosses)
-    before, turn = (
-        np.angle(values[:-1][crosses]),
-        np.angle(values[1:][crosses] / values[:-1][crosses]),
-    )
-    phase = np.mod(before + share * turn + np.pi, 2.0 * np.pi)
-    where = frequency[row] * (frequency[row + 1] / frequency[row]) ** share
+    ratio = frequency[row + 1] / frequency[row]
+    where = frequency[row] * ratio**share
     return phase, where
 
 
 def _relevant(values: ComplexArray) -> ComplexArray:
     """Return the loci that are not zero by construction, as those of the null space are."""
-    return values[:, np.abs(values).max(axis=0) > NEGLIGIBLE]
+    return values[:, np.abs(values).max(axis=0) > NEGLIGIBLE_LOCUS]
