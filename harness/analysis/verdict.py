@@ -39,8 +39,9 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED
 from servobench.harness.run.result import COMPLETED
 
-NAMED, MANY = 3, 6  # controllers that a sentence names at most
-MOST_PLACES: Final = 24  # for which leaders are named
+NAMED: Final = 3  # controllers or places that a short list names at most
+MANY: Final = 6  # those that a long list names at most
+MOST_PLACES: Final = 24  # places for which leaders are named
 
 
 @dataclass(frozen=True)
@@ -58,15 +59,21 @@ def judge(runs: pd.DataFrame) -> Verdict:
     ranked = ranked_controllers(runs)
     bounds = [str(name) for name in dict.fromkeys(runs["controller"]) if name not in ranked]
     early = int((runs["status"] != COMPLETED).sum())
-    cautions = [f"{early} of {len(runs)} runs ended early."] if early else []
+    cautions = []
+    if early:
+        cautions.append(f"{early} of {len(runs)} runs ended early.")
     if bounds:
         know = "knows" if len(bounds) == 1 else "know"
         cautions.append(f"{_listed(bounds)} {know} the true robot: shown, not ranked.")
     chosen = runs[runs["controller"].isin(ranked)]
     if len(ranked) == 1:
         return Verdict(_of_one_controller(chosen), tuple(cautions))
-    result, *further = filter(None, (_winners(runs, ranked), _of_several(chosen)))
-    return Verdict(result, (*further, _doubts(chosen), *cautions))
+    winners = _winners(runs, ranked)
+    rates = _of_several(chosen)
+    doubts = _doubts(chosen)
+    if not winners:
+        return Verdict(rates, (doubts, *cautions))
+    return Verdict(winners, (rates, doubts, *cautions))
 
 
 def ranked_controllers(runs: pd.DataFrame) -> list[str]:
@@ -77,13 +84,12 @@ def ranked_controllers(runs: pd.DataFrame) -> list[str]:
 
 def asked_of(runs: pd.DataFrame) -> str:
     """Return the goal of these runs as a verb in the past tense."""
-    words: dict[tuple[bool, ...], str] = {
-        (True, False): "settled",
-        (False, True): "followed the curve",
-    }
-    return words.get(
-        tuple(len(part) > 0 for part in split_tasks(runs)), "settled or followed the curve"
-    )
+    moves, curves = split_tasks(runs)
+    if len(moves) and not len(curves):
+        return "settled"
+    if len(curves) and not len(moves):
+        return "followed the curve"
+    return "settled or followed the curve"
 
 
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
@@ -112,22 +118,24 @@ def judged_values(place: pd.DataFrame) -> pd.DataFrame:
 def judged_column(runs: pd.DataFrame) -> pd.Series[float]:
     """Return the judged metric of each run in the unit in which it is shown; infinite where the run is lost."""
     metric = judged_metric(runs)
-    values = shown_unit(metric, runs)[1] * column_of(runs, metric).where(
-        runs["status"] == COMPLETED
-    )
-    return values.fillna(np.inf)
+    _, factor = shown_unit(metric, runs)
+    completed = column_of(runs, metric).where(runs["status"] == COMPLETED)
+    return (factor * completed).fillna(np.inf)
 
 
 def _of_one_run(runs: pd.DataFrame) -> str:
     (row,) = runs.assign(outcome=outcomes(runs)).to_dict("records")
-    name, place = row["controller"], f"{row['task']} on {row['plant']}"
+    name = row["controller"]
+    place = f"{row['task']} on {row['plant']}"
     if row["status"] != COMPLETED:
         return f"`{name}` ended {place} early: {row['status']}."
     unit, factor = shown_unit("rms_error_evaluated", runs)
     if achievement(runs) == FOLLOWED:
         verb = "followed" if row["outcome"] in ACHIEVED else f"did not follow ({row['outcome']})"
-        return f"`{name}` {verb} {place} with an RMS error of {factor * row['rms_error_evaluated']:.1f} {unit}."
-    last = f"with an error of {factor * row['steady_state_error']:.1f} {unit} in the last second"
+        error = factor * row["rms_error_evaluated"]
+        return f"`{name}` {verb} {place} with an RMS error of {error:.1f} {unit}."
+    error = factor * row["steady_state_error"]
+    last = f"with an error of {error:.1f} {unit} in the last second"
     if row["outcome"] in ACHIEVED:
         return f"`{name}` settled in {place} after {row['settling_time_s']:.2f} s, {last}."
     return f"`{name}` did not settle in {place} ({row['outcome']}): it ended {last}."
@@ -135,7 +143,8 @@ def _of_one_run(runs: pd.DataFrame) -> str:
 
 def _of_one_controller(runs: pd.DataFrame) -> str:
     sentence = f"`{runs['controller'].iloc[0]}` {asked_of(runs)} in {_share(runs)}"
-    if len(split_tasks(runs)[0]) == len(runs) and len(split_conditions(runs)) == 1:
+    moves, _ = split_tasks(runs)
+    if len(moves) == len(runs) and len(split_conditions(runs)) == 1:
         middle = median_with_interval(settling_times(runs))
         if math.isfinite(middle.value):  # else half of the runs or more never settled
             sentence += f", after a median of {middle.value:.2f} s"
@@ -147,25 +156,28 @@ def _of_one_controller(runs: pd.DataFrame) -> str:
 def _of_several(runs: pd.DataFrame) -> str:
     """Return how often ranked controllers succeeded."""
     shares = _shares(runs)
-    asked, most, least = asked_of(runs), max(shares.values()), min(shares.values())
-    best, worst = (
-        [name for name, share in shares.items() if share == each] for each in (most, least)
-    )
+    asked = asked_of(runs)
+    most = max(shares.values())
+    least = min(shares.values())
     if most == 0.0:
         return f"None of the {len(shares)} controllers {asked} in any of {len(runs)} runs."
     if most == least:
         everyone = "Both controllers" if len(shares) == 2 else f"All {len(shares)} controllers"
         often = "every run" if most == 1.0 else f"{100.0 * most:.0f} % of their runs"
         return f"{everyone} {asked} in {often}."
+    best = [name for name, share in shares.items() if share == most]
+    worst = [name for name, share in shares.items() if share == least]
+    each = "each " if len(best) > 1 else ""
+    top = f"{_listed(best)} {each}{asked} in {_common_share(runs, best, most)}"
+    return f"{top}; least often {_listed(worst)}, in {_common_share(runs, worst, least)}."
+
+
+def _common_share(runs: pd.DataFrame, names: list[str], share: float) -> str:
+    """Return the share of successes that some controllers have in common, with counts where these agree, too."""
     counts = runs["controller"].value_counts()  # they differ in an unfinished batch
-    first, last = (
-        _share(runs[runs["controller"] == names[0]])
-        if counts[names].nunique() == 1
-        else f"{100.0 * share:.0f} % of runs"
-        for names, share in ((best, most), (worst, least))
-    )
-    top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}"
-    return f"{top}; least often {_listed(worst)}, in {last}."
+    if counts[names].nunique() > 1:
+        return f"{100.0 * share:.0f} % of runs"
+    return _share(runs[runs["controller"] == names[0]])
 
 
 class _Standing(NamedTuple):
@@ -179,7 +191,14 @@ class _Standing(NamedTuple):
     by: float  # mean difference to it [unit]; NaN where only lost runs tell
     metric: str
     unit: str
-    margin: float  # [unit] that does not matter
+    margin: float  # difference that does not matter [unit]
+
+    @property
+    def result(self) -> tuple[object, ...]:
+        """Everything but the place and the numbers: places with the same result share a clause."""
+        only_lost = math.isnan(self.by)
+        contest = self.equal, self.undecided, self.ahead, self.behind
+        return (*contest, only_lost, self.metric, self.unit)
 
 
 def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
@@ -189,61 +208,79 @@ def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
         return ""
     groups: dict[tuple[object, ...], list[_Standing]] = {}
     for each in known:
-        told = (
-            each.equal,
-            each.undecided,
-            each.ahead,
-            each.behind,
-            math.isnan(each.by),
-            each.metric,
-            each.unit,
-        )
-        groups.setdefault(told, []).append(each)
+        groups.setdefault(each.result, []).append(each)
     return "; ".join(_clause(own, len(known)) for own in groups.values()) + "."
 
 
 def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
-    order, against, metric = *_ranked(place, own), judged_metric(place)
+    order, against = _ranked(place, own)
+    metric = judged_metric(place)
     unit, factor = shown_unit(metric, place)
-    having = {
-        verdict: tuple(name for name, each in against.items() if each.verdict == verdict)
-        for verdict in ("equivalent", "undecided", "worse", "better")
-    }
-    behind = next(iter(having["better"]), "")
     small = factor * margin(metric, place)
-    by = -against[behind].mean.value if behind and against[behind].mean.high < -small else math.nan
-    best = (order[0], *having["equivalent"])
-    equal = tuple(name for name in dict.fromkeys(own["controller"]) if name in best)
+    # Verdicts are on the first: those against which it is better are behind it.
+    having: dict[str, list[str]] = {}
+    for name, difference in against.items():
+        having.setdefault(difference.verdict, []).append(name)
+    best = [order[0], *having.get("equivalent", [])]
+    behind = next(iter(having.get("better", [])), "")
+    by = math.nan
+    if behind and against[behind].mean.high < -small:
+        by = -against[behind].mean.value
     return _Standing(
-        words, equal, having["undecided"], having["worse"], behind, by, metric, unit, small
+        where=words,
+        equal=tuple(name for name in dict.fromkeys(own["controller"]) if name in best),
+        undecided=tuple(having.get("undecided", ())),
+        ahead=tuple(having.get("worse", ())),
+        behind=behind,
+        by=by,
+        metric=metric,
+        unit=unit,
+        margin=small,
     )
 
 
 def _clause(places: Sequence[_Standing], count: int) -> str:
     """Return the result of places with the same winners, of `count` places in all."""
-    one, label = places[0], METRICS[places[0].metric].label
-    where = f" in {_listed([each.where for each in places], MANY)}" if count > 1 else ""
-    many, parts = len(one.equal) > 1, []
+    one = places[0]
+    label = METRICS[one.metric].label
+    many = len(one.equal) > 1
+    verb = "are" if many else "is"
+    rank = "first" if one.undecided else "best"
+    words = f"{_listed(one.equal, MANY)} {verb} {rank}"
+    if count > 1:
+        words += f" in {_listed([each.where for each in places], MANY)}"
+    parts = []
     if many:
-        parts.append(f"equal within {max(each.margin for each in places):.2g} {one.unit}")
-    low, high = (f"{end(each.by for each in places):.2f}" for end in (min, max))
-    fewer_lost = one.behind and "nan" in (low, high)
-    if one.behind and not fewer_lost:
-        parts.append(
-            f"{low if low == high else f'{low} to {high}'} {one.unit} ahead of `{one.behind}`"
-        )
-    words = f"{_listed(one.equal, MANY)} {'are' if many else 'is'} {'first' if one.undecided else 'best'}{where}"
-    words += f": {' and '.join(parts)} in {label}" if parts else ""
-    words += f", losing fewer runs than `{one.behind}`" if fewer_lost else ""
+        widest = max(each.margin for each in places)
+        parts.append(f"equal within {widest:.2g} {one.unit}")
+    only_lost = math.isnan(one.by)  # the same in all of these places
+    if one.behind and not only_lost:
+        parts.append(f"{_range([each.by for each in places])} {one.unit} ahead of `{one.behind}`")
+    if parts:
+        words += f": {' and '.join(parts)} in {label}"
+    if one.behind and only_lost:
+        words += f", losing fewer runs than `{one.behind}`"
     if one.undecided:
         words += f", undecided against {_listed(one.undecided, MANY)}"
-    return words + (f", though {_listed(one.ahead, MANY)} had less {label}" if one.ahead else "")
+    if one.ahead:
+        words += f", though {_listed(one.ahead, MANY)} had less {label}"
+    return words
+
+
+def _range(numbers: Sequence[float]) -> str:
+    """Return the least and the greatest of some numbers, or one number where both are written alike."""
+    low = f"{min(numbers):.2f}"
+    high = f"{max(numbers):.2f}"
+    if low == high:
+        return low
+    return f"{low} to {high}"
 
 
 def _doubts(runs: pd.DataFrame) -> str:
     """Return how far the order of controllers can be trusted."""
     shared = runs.groupby("seed")["controller"].nunique() > 1  # they differ in an unfinished batch
-    seeds, count = int(shared.sum()), runs["controller"].nunique()
+    seeds = int(shared.sum())
+    count = runs["controller"].nunique()
     if seeds < MIN_PAIRS:
         had = "One seed is" if seeds == 1 else f"{seeds} seeds are"
         which = "the two" if count == 2 else f"any two of {count}"
@@ -253,16 +290,19 @@ def _doubts(runs: pd.DataFrame) -> str:
         )
     achieved = runs.assign(score=outcomes(runs).isin(ACHIEVED).astype(float))
     table = achieved.pivot_table(index="seed", columns="controller", values="score", sort=False)
-    best = max((shares := _shares(runs)), key=lambda name: shares[name])
-    ahead = {name: table[best] - table[name] for name in shares}
-    apart = [
-        name
-        for name, each in ahead.items()
-        if is_majority(int((each > 0.0).sum()), int((each < 0.0).sum()))
-    ]
-    if not apart:
+    shares = _shares(runs)
+    best = max(shares, key=lambda name: shares[name])
+    less_often = []
+    for name in shares:
+        ahead = table[best] - table[name]  # by seed, in the share of its tasks
+        better = int((ahead > 0.0).sum())
+        worse = int((ahead < 0.0).sum())
+        if is_majority(better, worse):
+            less_often.append(name)
+    if not less_often:
         return "The success rates do not differ significantly."
-    less = f"{_listed(apart, MANY)} succeed{'s' if len(apart) == 1 else ''} significantly less often than `{best}`"
+    verb = "succeeds" if len(less_often) == 1 else "succeed"
+    less = f"{_listed(less_often, MANY)} {verb} significantly less often than `{best}`"
     return f"{less} (sign test over seeds)."
 
 
@@ -272,38 +312,49 @@ def _competitions(
     """Return each place with more than one of some controllers: words, its runs, and those of these controllers."""
     places = split_conditions(runs)
     alone = len(places) == runs["task"].nunique()
-    found = [
-        (str(place["task"].iloc[0]) if alone else words, place, own)
-        for words, place in places
-        if (own := place[place["controller"].isin(names)])["controller"].nunique() > 1
-    ]
+    found = []
+    for words, place in places:
+        own = place[place["controller"].isin(names)]
+        if own["controller"].nunique() > 1:
+            where = str(place["task"].iloc[0]) if alone else words
+            found.append((where, place, own))
     return found if len(found) <= MOST_PLACES else []
 
 
 def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str, Difference]]:
     """Return the controllers of a place, best first, and how the first one differs from each other one."""
-    table, shares = judged_values(place), _shares(own)
-    order = sorted(shares, key=lambda name: (-shares[name], table[name].median()))
-    small = shown_unit(judged_metric(place), place)[1] * margin(judged_metric(place), place)
-    pairs = {name: table[[order[0], name]].dropna() for name in order[1:]}
-    return order, {
-        name: paired_difference(each.iloc[:, 0], each.iloc[:, 1], small)
-        for name, each in pairs.items()
-    }
+    table = judged_values(place)
+    shares = _shares(own)
+    metric = judged_metric(place)
+    _, factor = shown_unit(metric, place)
+    small = factor * margin(metric, place)
+    first, *others = sorted(shares, key=lambda name: (-shares[name], table[name].median()))
+    against = {}
+    for name in others:
+        pair = table[[first, name]].dropna()
+        against[name] = paired_difference(pair.iloc[:, 0], pair.iloc[:, 1], small)
+    return [first, *others], against
 
 
 def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
-    table, metric, shares = judged_values(place), judged_metric(place), _shares(own)
+    """Return a row of `leaders`: the first two controllers of a place, and those that are not shown to be behind."""
+    table = judged_values(place)
+    shares = _shares(own)
+    metric = judged_metric(place)
     unit, _ = shown_unit(metric, place)
+    spec = f".{METRICS[metric].digits}f"
     (first, second, *_), against = _ranked(place, own)
     rivals = [name for name, each in against.items() if each.verdict != "better"]
+    sure = _listed(rivals).replace("`", "") if rivals else "none"
 
     def median(name: str) -> str:
-        value, *interval = (
-            f"{median_with_interval(table[name].dropna()):.{METRICS[metric].digits}f}".split(" ", 1)
-        )
-        lost = f"({100.0 * (1.0 - shares[name]):.0f} % lost)" if shares[name] < 1.0 else ""
-        return " ".join([value, unit, *interval, lost]).rstrip()
+        """Return a controller's median with unit, interval and the share of its lost runs."""
+        text = format(median_with_interval(table[name].dropna()), spec)
+        value, *interval = text.split(" ", 1)
+        parts = [value, unit, *interval]
+        if shares[name] < 1.0:
+            parts.append(f"({100.0 * (1.0 - shares[name]):.0f} % lost)")
+        return " ".join(parts).rstrip()
 
     return {
         ("", "where"): words,
@@ -312,22 +363,21 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
         ("First", "median"): median(first),
         ("Next", "controller"): second,
         ("Next", "median"): median(second),
-        ("How sure", "not shown to be behind the first"): _listed(rivals).replace("`", "")
-        if rivals
-        else "none",
+        ("How sure", "not shown to be behind the first"): sure,
     }
 
 
 def _shares(runs: pd.DataFrame) -> dict[str, float]:
+    """Return the share of successful runs of each controller."""
     good = outcomes(runs).isin(ACHIEVED)
-    return {
-        str(name): float(share)
-        for name, share in good.groupby(runs["controller"], sort=False).mean().items()
-    }
+    means = good.groupby(runs["controller"], sort=False).mean()
+    return {str(name): float(share) for name, share in means.items()}
 
 
 def _share(runs: pd.DataFrame) -> str:
-    good, share = int(outcomes(runs).isin(ACHIEVED).sum()), achieved_share(runs)
+    """Return how many runs were successful, with the interval of their share."""
+    good = int(outcomes(runs).isin(ACHIEVED).sum())
+    share = achieved_share(runs)
     return f"{good} of {len(runs)} runs (95 % interval: {share.low:.0f} to {share.high:.0f} %)"
 
 
@@ -336,4 +386,6 @@ def _listed(names: Sequence[str], most: int = NAMED) -> str:
     words = [f"`{name}`" for name in names]
     if len(words) > most:
         words = [*words[: most - 1], f"{len(words) - most + 1} more"]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    if len(words) == 1:
+        return words[0]
+    return f"{', '.join(words[:-1])} and {words[-1]}"
