@@ -71,7 +71,7 @@ CHUNK: Final = (
 class Job:
     """A cell with its settings."""
 
-    index: int  # of the cell in its plan
+    index: int  # index of the cell in its plan
     cell: Cell
     run: ResolvedRun
     kind: Hashable | None = (

@@ -27,7 +27,7 @@ REMADE: Final = (
 class Finding:
     """A damaged file of a results folder."""
 
-    name: str  # of the file within the folder
+    name: str  # name of the file within the folder
     fault: str  # a predicate of the file
     remedy: str  # for the user
 
@@ -205,10 +205,10 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class _Part:
-    names: list[str]  # of its files within the folder, rows last
-    count: int  # of its runs that are intact
+    names: list[str]  # names of its files within the folder, rows last
+    count: int  # number of its runs that are intact
     wrong: str  # name of its damaged file, or of its rows
-    fault: str  # of that file; empty if there is none
+    fault: str  # fault of that file; empty if there is none
 
 
 def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:

@@ -39,7 +39,7 @@ class Holder:
     host: str
     pid: int
     begun: str  # date and time at which it took the lock, UTC
-    started: str  # of the process, as the system counts; a later process with the same number differs here
+    started: str  # start of the process, as the system counts; a later one with the same number differs here
 
     @classmethod
     def this_process(cls) -> Self:
@@ -77,7 +77,7 @@ class Lock:
     """A lock that this process holds."""
 
     file: Path
-    descriptor: int  # of the open file
+    descriptor: int  # descriptor of the open file
     stale: Holder | None  # the holder before, which ended without giving the lock back
 
     def check(self) -> None:

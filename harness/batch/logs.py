@@ -78,7 +78,7 @@ def logged_in_folder(
     row, manifest = find_run(folder, run_id), results.read_manifest(folder)
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
         name = str(row.get(word, ""))
-        # of the user's code, whose name may be any
+        # Code of users may have any name.
         place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")
         if place or (CODE.search(name) and name != sensing):
             remedy = (

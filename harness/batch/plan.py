@@ -36,9 +36,9 @@ from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
 DEFAULT_MISMATCH: Final = "moderate"  # On plants with robots of their own it stands for none.
-MAX_SEEDS: Final = 1_000_000  # of a batch
+MAX_SEEDS: Final = 1_000_000  # seeds of a batch
 MAX_SEED: Final = 2**63 - 1  # which the tables hold
-MAX_SHOWN: Final = 200  # [characters] of a given text, in a message
+MAX_SHOWN: Final = 200  # [characters] length of a given text in a message
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 TUNING_WORDS: Final = f"{TUNING.start}:{TUNING.stop}"
 
@@ -381,7 +381,7 @@ class Survey:
     seeds: list[range] = field(default_factory=list)  # in order, without gaps within each
     examples: list[RunRequest] = field(default_factory=list)
     """With every plant in every condition (mismatch, varied settings) and with every controller, and every task."""
-    digest: str = ""  # of all runs in their order
+    digest: str = ""  # digest of all runs in their order
 
     @property
     def sections(self) -> list[str]:

@@ -28,10 +28,10 @@ import psutil
 
 from servobench.harness.batch.container import memory_limit, processor_limit
 
-LINUX: Final = sys.platform == "linux"  # of the other systems, macOS is provided for
-SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-KEPT_MEMORY: Final = 2**30  # [bytes] of freed memory that a worker keeps
+LINUX: Final = sys.platform == "linux"  # other systems: macOS is provided for
+SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # options of prctl(2)
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
+KEPT_MEMORY: Final = 2**30  # [bytes] freed memory that a worker keeps
 # [bytes] from which on a block has pages of its own; glibc takes no larger threshold
 LARGEST_BLOCK: Final = 2**25
 FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
@@ -49,7 +49,7 @@ class Limits:
     """Resources of a run; infinity for no limit."""
 
     time: float = math.inf  # [s] from one answer to the next
-    memory: float = math.inf  # [bytes] of a run and the processes that it starts
+    memory: float = math.inf  # [bytes] memory of a run and the processes that it starts
     addresses: bool = (
         False  # refuse each process more than this memory at once, even if it never touches it
     )

@@ -300,7 +300,7 @@ def load_runs(folder: Path) -> pd.DataFrame:
     }
     runs = runs.astype(empty) if empty else runs
     period = (manifest.get("changed") or {}).get("run.period")
-    if isinstance(period, float):  # of all runs whose period no sweep varies
+    if isinstance(period, float):  # the period of all runs where no sweep varies it
         runs["period_s"] = runs["period_s"].fillna(period) if "period_s" in runs else period
     refuse_nameless(folder / names[0], runs)
     return runs

@@ -59,13 +59,13 @@ START_ERROR: Final = 1  # exit code of a guard that an error has kept from start
 STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
 MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
-MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
+MAX_ANSWER: Final = 2**30  # [bytes] length of one answer: a larger one is damaged
 MESSAGE_PAUSE: Final = (
     10  # [s] without a further byte, after which a message of a runner is given up
 )
 SILENT: Final = "the process of the run reported it as done without its answer"
 TALKATIVE: Final = "the process of the run gave more answers than it had runs"
-KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
+KEPT_SHARE: Final = 0.5  # share of the memory limit that a runner may hold between two tasks
 GUARD: Final = "servobench guard"  # name of its process
 ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
 
@@ -280,7 +280,7 @@ class Sandbox:
             if self._ended:
                 raise EOFError
             with _interrupts_blocked(), warnings.catch_warnings():  # a process inherits the former
-                # of Python 3.12: threads of libraries, which wait
+                # Python 3.12 warns of the threads of libraries, which only wait.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
             self._process = process
@@ -339,7 +339,7 @@ def keep_guard(
     processes.adopt_orphans()
     processes.keep_freed_memory()
     gc.freeze()  # so that runners go on sharing the memory of all imports
-    # of Python 3.11; a copy of the command has a larger one, under which memory piles up
+    # The default of Python 3.11; a copy of the command has a larger one, under which memory piles up.
     gc.set_threshold(700)
     guard = _Guard(link, limits)
     try:
@@ -494,7 +494,7 @@ def _be_runner(
         each.close()
     processes.forget_tracker()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    # of somebody else; not ignored, which programs started here inherit
+    # An interrupt has no effect here. It is not ignored, as programs started here would inherit that.
     signal.signal(signal.SIGINT, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_SETMASK, set())
     faulthandler.enable(trace, all_threads=False)

@@ -27,7 +27,7 @@ ROW_GROUP: Final = (
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
 # of a table of any size, and for each byte of its file
 MAX_CELLS, MAX_CELLS_A_BYTE = (2 * 10**7, 100)
-MAX_TIME: Final = 1e9  # [s] of a step, which other formats count in nanoseconds
+MAX_TIME: Final = 1e9  # [s] time of a step, which other formats count in nanoseconds
 NO_THREAD: Final = "launch worker thread"  # in a message of Arrow
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
 

@@ -19,10 +19,10 @@ PERIOD: Final = 0.05  # [s]
 OTHER: Final = "panda", 0.1  # a second robot, and its period [s]
 MISMATCH: Final = "moderate+gear_ratio=5%"
 STEPS: Final = 6
-SHARE: Final = 0.5  # of the joint-speed limits, within which commands are drawn
+SHARE: Final = 0.5  # share of the joint-speed limits within which commands are drawn
 # [rad] by which the first and the last joint are moved, those between by lengths between
 MOTION: Final = (0.05, 0.1)
-# [s] of such a motion, and of the rest after it, longer than usual delays
+# [s] Length of such a motion and of the rest after it, which is longer than usual delays.
 MOTION_TIME, REST_TIME = (0.5, 1.0)
 TURN: Final = (
     0.2  # [rad] of the first joint at the start, so that no feature of the two robots is near zero
@@ -30,13 +30,13 @@ TURN: Final = (
 START_TOLERANCE: Final = 0.01  # [rad]
 FOLLOWING: Final = (0.6, 1.6)  # a motion over the commanded one
 SAMPLES: Final = 5  # last features at rest, whose median has little noise and no outliers
-FEATURE_TOLERANCE: Final = 0.05  # of the feature, or of its natural size if that is larger
+FEATURE_TOLERANCE: Final = 0.05  # share of the feature, or of its natural size if that is larger
 NOMINAL_SHARE: Final = (
     0.2  # of the distance from the true model, within which a plant is that of the nominal model
 )
 CLIPPED_STEPS: Final = 4  # more than a usual command delay
-JACOBIAN_STEPS: Final = 4  # of a slow motion that the true Jacobian has to predict
-JACOBIAN_TOLERANCE: Final = 0.05  # of the motion of the feature
+JACOBIAN_STEPS: Final = 4  # steps of a slow motion that the true Jacobian has to predict
+JACOBIAN_TOLERANCE: Final = 0.05  # share of the motion of the feature
 MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which the Jacobian cannot be judged
 
 

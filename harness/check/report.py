@@ -14,7 +14,7 @@ from servobench.harness.run.result import WrongAnswer
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
-WIDTH: Final = 14  # of the names of checks, in print
+WIDTH: Final = 14  # [characters] width of the names of checks in print
 HAPPENS: Final = "; this happens with "  # begin of the notes of `naming`
 
 

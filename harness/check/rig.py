@@ -25,10 +25,10 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 
 PERIOD: Final = 0.05  # [s]
 PREVIEW: Final = 10  # [rows]
-MAX_PERIODS: Final = 1000  # of a run
+MAX_PERIODS: Final = 1000  # length of a run in periods
 BEND: Final = 0.02  # [1/rad²]
 MODEL_ERROR: Final = 1.05  # nominal over true Jacobian
-NOISE: Final = 1e-3  # [m] of the feature
+NOISE: Final = 1e-3  # [m] noise of the feature
 SMALL_TRAINING: Final = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 
 
@@ -37,7 +37,7 @@ class Conditions:
     """The conditions of a run on the arm."""
 
     preview: int = PREVIEW  # [rows]
-    scale: float = 1.0  # of features and reference
+    scale: float = 1.0  # factor on features and reference
     lost: range = range(0)  # periods in which the feature is lost
     at_goal: bool = False  # whether the arm stands at its goal and is not moved
 
@@ -153,7 +153,7 @@ class Driver:
         """Take controller, rig, and the seed of start, goal and noise, which `reset` gets, too."""
         self.controller, self.rig, self.seed = controller, rig, seed
         self._held = HeldController(controller, rig.spec)
-        self.times: list[float] = []  # [s] of each step
+        self.times: list[float] = []  # [s] duration of each step
 
     def begin(self) -> Self:
         """Reset the controller."""

@@ -250,7 +250,7 @@ def _line_of_system(error: OSError | RuntimeError) -> str | None:
         return "no more threads or processes may be started here: ulimit -u"
     if isinstance(error, UnwritableFolder):
         return str(error.strerror)
-    if error.errno == errno.ENOENT and "temporary directory" in str(error):  # of tempfile
+    if error.errno == errno.ENOENT and "temporary directory" in str(error):  # an error of tempfile
         return "no temporary folder takes a file; free room in one, or name another: TMPDIR=FOLDER servobench ..."
     if error.errno not in FULL:
         return None

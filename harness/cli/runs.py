@@ -26,7 +26,7 @@ from servobench.plant.contract.files import point_latest
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Campaign, Execution
 
-DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
+DEFAULT_CONTROLLER = "ukf_mfac"  # controller of a run for which none is named
 
 OutOption = Annotated[
     Path | None,

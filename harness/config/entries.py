@@ -347,7 +347,7 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
     """Return the class of the settings that a constructor takes before `argument`; None if it takes none."""
     try:
         parameters = list(inspect.signature(kind).parameters.values())
-    except (TypeError, ValueError):  # of compiled code
+    except (TypeError, ValueError):  # compiled code has no signature
         return None
     positional = [
         each

@@ -82,15 +82,15 @@ def can_travel(own: Sequence[Offer]) -> bool:
 class Registry(Generic[Entry]):
     """Entries of a kind by name: of this package, given by the user, or published by other distributions."""
 
-    kind: Kind[Entry]  # of the entries
-    group: str  # of the entry points by which others publish them
+    kind: Kind[Entry]  # kind of the entries
+    group: str  # group of the entry points by which others publish them
     own: Mapping[
         str, Entry | str
     ]  # those of this package, or their place `MODULE:NAME` where that loads slowly
     # makes the entry of a name with a meaning of its own; None for other names
     made: Callable[[str], Entry | None] = lambda _: None
     advice: Callable[[str], str] = lambda _: ""  # about an unknown name; empty for the nearest name
-    suffixes: tuple[str, ...] = ()  # of files whose name is `fmu:PATH`
+    suffixes: tuple[str, ...] = ()  # suffixes of files whose name is `fmu:PATH`
 
     def names(self) -> list[str]:
         """Return all names, those of this package first."""
@@ -188,7 +188,7 @@ class Registry(Generic[Entry]):
         return [(name, line) for (name, _), line in found.items()]
 
 
-# of all groups: to find them takes a file of each installed distribution
+# Entry points of all groups: to find them takes a file of each installed distribution.
 _published: Final = cache(entry_points)
 
 

@@ -23,7 +23,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import is_file, reason, user_path
 from servobench.plant.contract.settings import suggest
 
-Name: TypeAlias = tuple[str, ...]  # of a module, by its parts
+Name: TypeAlias = tuple[str, ...]  # name of a module, by its parts
 
 PLACE: Final = re.compile(
     r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.(?i:py))(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
@@ -37,7 +37,7 @@ _MODULES_OF_USERS: Final[set[str]] = set()  # top-level modules that users named
 class SourceFile:
     """A Python file as it was read. It can be pickled: a process that receives it carries out the same text."""
 
-    path: Path  # of the file, absolute
+    path: Path  # absolute path of the file
     text: str  # its content
 
     @classmethod

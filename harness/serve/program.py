@@ -25,9 +25,9 @@ SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")
 COMMAND: Final = "input_int_register_0"
 COMMANDS: Final = CONTROLLER["commands"]["names"].split()
 WITHOUT_ANSWER: Final = frozenset(CONTROLLER["commands"]["without_answer"])
-STOP_DECELERATION: Final = 10.0  # [rad/s²] of an arm whose program ended
+STOP_DECELERATION: Final = 10.0  # [rad/s²] deceleration of an arm whose program ended
 LONGEST_MOVE: Final = 300.0  # [s] with its settling
-POSITION_GAIN: Final = 5.0  # [1/s] of moveJ, with which such a drive does not swing
+POSITION_GAIN: Final = 5.0  # [1/s] gain of moveJ with which such a drive does not swing
 POSITION_TOLERANCE: Final = 1e-3  # [rad] within which moveJ has arrived
 UNLOCK_AFTER: Final = (
     5.0  # [s] that a protective stop lasts at least, by UR's page on the dashboard server

@@ -37,7 +37,7 @@ from servobench.plant.contract.signals import Command
 Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
 # All but the last are UR's
 PORTS: Final = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}
-RATE: Final = 500.0  # [Hz] of the controller of an e-Series robot
+RATE: Final = 500.0  # [Hz] rate of the controller of an e-Series robot
 HEARTBEAT: Final = 0.004  # [s] between two packets while lockstep waits
 BACKLOG: Final = 0.1  # [s] behind the wall clock from which the backlog is dropped
 SEND_BUFFER: Final = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
