@@ -48,9 +48,11 @@ from servobench.harness.pictures.tracks import (
 from servobench.harness.run.request import UNFIT_FOR_FILES
 
 FOLDER = "figures"
-LETTERS = 15.0  # of a title in an inch
+LETTERS = 15.0  # letters of a title in an inch
 TASKS_A_FIGURE = 4  # also blocks of paths
-FIRST, OVER, EACH = "first seed", "median and band over seeds", "each seed"
+FIRST = "first seed"
+OVER = "median and band over seeds"
+EACH = "each seed"
 
 
 class Kind(NamedTuple):
@@ -86,7 +88,7 @@ class NamedFigure(NamedTuple):
     kind: str  # one of KINDS
     stem: str  # name of its file without ending
     title: str  # the heading, and the place and seeds of its runs
-    tasks: tuple[str, ...]  # that it shows; none if it is of all
+    tasks: tuple[str, ...]  # the tasks that it shows; empty if it shows all
     figure: Figure
 
 
@@ -95,10 +97,9 @@ class Choice:
     """The figures that are wanted of a folder, and their appearance."""
 
     kinds: Collection[str] = tuple(KINDS)  # some of KINDS
-    names: Mapping[str, str] | None = (
-        None  # controllers that are shown, with their names in the figures; None for all
-    )
-    layout: Layout = WIDE  # of the figures; a narrow one shows tasks one by one
+    # Controllers that are shown, with their names in the figures; None for all.
+    names: Mapping[str, str] | None = None
+    layout: Layout = WIDE  # layout of the figures; a narrow one shows tasks one by one
     title: bool = True  # whether the figures have titles
 
 
@@ -108,12 +109,10 @@ def draw_figures(folder: Path) -> list[Path]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    figures = folder_figures(folder)
-    return [
-        path
-        for named in figures
-        for path in save_figure(named.figure, folder / FOLDER / named.stem, ("png",))
-    ]
+    paths: list[Path] = []
+    for named in folder_figures(folder):
+        paths += save_figure(named.figure, folder / FOLDER / named.stem, ("png",))
+    return paths
 
 
 def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFigure]:
@@ -130,9 +129,10 @@ def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFig
         styles = {shown: styles[name] for name, shown in choice.names.items()}
     size = TASKS_A_FIGURE if choice.layout.wide else 1
     for group, plan in _folder_plans(folder, runs, styles, size):
-        if plan.kind in choice.kinds and (
-            named := _carry_out(group, plan, choice.layout, title=choice.title)
-        ):
+        if plan.kind not in choice.kinds:
+            continue
+        named = _carry_out(group, plan, choice.layout, title=choice.title)
+        if named is not None:
             yield named
 
 
@@ -144,11 +144,11 @@ def page_figures(
     Raises:
         ConfigurationError: not a results folder.
     """
-    for group, plan in _folder_plans(folder, runs, method_styles(runs["controller"].tolist()), 1):
+    styles = method_styles(runs["controller"].tolist())
+    for group, plan in _folder_plans(folder, runs, styles, 1):
         if plan.kind in kinds:
-            wide, narrow = (
-                _carry_out(group, plan, layout, title=False) for layout in (WIDE, NARROW)
-            )
+            wide = _carry_out(group, plan, WIDE, title=False)
+            narrow = _carry_out(group, plan, NARROW, title=False)
             if wide is not None and narrow is not None:
                 yield wide, narrow
 
@@ -168,10 +168,8 @@ def _folder_plans(
     """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
     if len(runs) > 1:
         everything = Group("", "", runs, int(runs["seed"].min()), {})
-        yield (
-            everything,
-            _Plan("conditions", "", (), partial(draw_conditions, split_tasks(runs)[0], styles)),
-        )
+        moves, _ = split_tasks(runs)
+        yield everything, _Plan("conditions", "", (), partial(draw_conditions, moves, styles))
     for group in load_groups(folder, runs):
         for plan in _plans(group, load_ensembles(folder, group.runs), styles, size):
             yield group, plan
@@ -179,33 +177,34 @@ def _folder_plans(
 
 def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> NamedFigure | None:
     """Return a figure with its name and heading."""
-    heading, place = (
-        KINDS[plan.kind].heading,
-        f"{group.plant}, mismatch {group.mismatch}" if group.plant else "",
-    )
+    heading = KINDS[plan.kind].heading
+    place = f"{group.plant}, mismatch {group.mismatch}" if group.plant else ""
     details = ", ".join(filter(None, (plan.part, place, _sample(plan.kind, group))))
     with figure_style(TEXT):
         figure = plan.draw(layout)
         if figure is None:
             return None
         if title:
-            wrapped = (
-                textwrap.fill(text, round(LETTERS * figure.get_figwidth()))
-                for text in (heading, details)
-            )
+            letters = round(LETTERS * figure.get_figwidth())
+            wrapped = [textwrap.fill(heading, letters), textwrap.fill(details, letters)]
             figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
     words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
     return NamedFigure(
-        plan.kind, UNFIT_FOR_FILES.sub("_", words), f"{heading}: {details}", plan.tasks, figure
+        kind=plan.kind,
+        stem=UNFIT_FOR_FILES.sub("_", words),
+        title=f"{heading}: {details}",
+        tasks=plan.tasks,
+        figure=figure,
     )
 
 
 def _sample(kind: str, group: Group) -> str:
     """Return words for the seeds that a figure shows, and how."""
-    seeds, how = group.runs["seed"].nunique(), KINDS[kind].seeds
+    seeds = group.runs["seed"].nunique()
+    how = KINDS[kind].seeds
     if how == FIRST or seeds == 1:
         return f"seed {group.seed}"
-    # of an unfinished batch
+    # In an unfinished batch some controllers have fewer seeds than others.
     least = int(group.runs.groupby(["controller", "task"])["seed"].nunique().min())
     count = f"{least} to {seeds} seeds" if least < seeds else f"{seeds} seeds"
     if how == EACH:
@@ -219,38 +218,29 @@ def _plans(
 ) -> Iterator[_Plan]:
     """Yield the figures of a group: of its moves, of its curves, and of both."""
     moves = {task: tracks for task, tracks in group.tasks.items() if longest(tracks).point_to_point}
-    runs, everything = group.runs, tuple(group.tasks)
+    runs = group.runs
+    everything = tuple(group.tasks)
     until = {task: shown_until(ensembles[task]) for task in everything}
     for text, part in _parts(moves, size):
-        yield _Plan(
-            "errors",
-            text,
-            part,
-            partial(draw_moves, {task: ensembles[task] for task in part}, styles),
-        )
-        yield _Plan(
-            "features",
-            text,
-            part,
-            partial(draw_features, {task: moves[task] for task in part}, until, styles),
-        )
+        over_seeds = {task: ensembles[task] for task in part}
+        of_first_seed = {task: moves[task] for task in part}
+        yield _Plan("errors", text, part, partial(draw_moves, over_seeds, styles))
+        yield _Plan("features", text, part, partial(draw_features, of_first_seed, until, styles))
     heads = divisions(name for tracks in moves.values() for name in tracks)
     for text, part in _parts(moves, max(1, size // len(heads))):
-        yield _Plan(
-            "paths", text, part, partial(draw_paths, {task: moves[task] for task in part}, styles)
-        )
+        of_first_seed = {task: moves[task] for task in part}
+        yield _Plan("paths", text, part, partial(draw_paths, of_first_seed, styles))
     for task, tracks in group.tasks.items():
         if task not in moves:
-            yield _Plan(
-                "tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles)
-            )
+            draw = partial(draw_tracking, ensembles[task], tracks, styles)
+            yield _Plan("tracking", task, (task,), draw)
             yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
-    several = len(runs) > 1  # of a single run, its row in the table of runs says it all
-    for text, part in _parts(runs["task"].unique() if several else (), size):
-        chosen = runs[runs["task"].isin(part)]
-        for kind in FIGURES:
-            yield _Plan(kind, text, part, partial(draw_measures, chosen, kind, styles))
+    if len(runs) > 1:  # the row of a single run in the table of runs says it all
+        for text, part in _parts(runs["task"].unique(), size):
+            chosen = runs[runs["task"].isin(part)]
+            for kind in FIGURES:
+                yield _Plan(kind, text, part, partial(draw_measures, chosen, kind, styles))
     yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
         yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until[task]))

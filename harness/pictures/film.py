@@ -38,23 +38,30 @@ from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.robot.workspace import BALL_RADIUS
 
 MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
-WIDTH, HEIGHT = 960, 816  # px of a frame; ffmpeg wants multiples of 16
-# Px: line of text on top, overview below it at the left
-HEAD, VIEW_WIDTH, VIEW_HEIGHT = (48, 640, 480)
-TYPE = 19.0  # [pt] of all words: 9 px high where a page on a telephone shows the frame 330 px wide
-SIDE = WIDTH - VIEW_WIDTH
-CAMERA_HEIGHT = 240  # px
+# [px] Size of a frame; ffmpeg wants multiples of 16.
+WIDTH = 960
+HEIGHT = 816
+HEAD = 48  # [px] height of the title, which is above both pictures
+# [px] Size of the overview, which is below the title at the left.
+VIEW_WIDTH = 640
+VIEW_HEIGHT = 480
+# [pt] Size of all words: 9 px high where a page on a telephone shows the frame 330 px wide.
+TYPE = 19.0
+SIDE = WIDTH - VIEW_WIDTH  # [px] width of the camera's picture, right of the overview
+CAMERA_HEIGHT = 240  # [px]
 MAX_RATE = 25.0  # frames a second
 FINENESS = 1.25  # pixels rendered for one pixel of the overview, along each side
-REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
+REFERENCE_COLOUR = (40, 40, 40)
+REFERENCE_HEX = "#282828"  # the same colour
 SNAPSHOT_COUNT = 8
-MIN_ADVANCE = (
-    0.01  # of the extent of the ball's path: shorter ways are the jitter of an arm at rest
-)
-CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: larger than the ball
-CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
-GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
-QUALITY = "22"  # of H.264: smaller is better and larger
+# [1] Ways shorter than this share of the extent of the ball's path are the jitter of an arm at rest.
+MIN_ADVANCE = 0.01
+CROSS = 2.5 * BALL_RADIUS  # [m] half the size of the cross at a fixed target: larger than the ball
+# [1] Distance, as a share of a curve's size, within which a reference counts as back at its start.
+CLOSED = 0.05
+GIF_WIDTH = 640  # [px]
+GIF_RATE = 10  # frames a second
+QUALITY = "22"  # constant rate factor of H.264: a smaller one gives a better, larger film
 
 
 def write_recording(
@@ -82,15 +89,18 @@ def write_recording(
     if ffmpeg is None:
         return paths
     stem.parent.mkdir(parents=True, exist_ok=True)
-    board, time = _Board(run), run.track.time
-    count, period = len(time), float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    # Periods from frame to frame; the film lasts as long as the run
+    board = _Board(run)
+    time = run.track.time
+    count = len(time)
+    period = float(np.median(np.diff(time))) if count > 1 else 1.0
+    # A frame stands for `step` periods, so that the film lasts as long as the run.
     step = max(1, round(1.0 / (MAX_RATE * period)))
     rate = 1.0 / (step * period)
     with ExitStack() as stack:
-        writers = [
-            stack.enter_context(encoding(ffmpeg, film, (WIDTH, HEIGHT), rate)) for film in films
-        ]
+        writers = []
+        for film in films:
+            encoder = encoding(ffmpeg, film, (WIDTH, HEIGHT), rate)
+            writers.append(stack.enter_context(encoder))
         replay = stack.enter_context(Replay(run, fineness=FINENESS))
         for k in range(0, count, step):
             progress(k / count, "frames")
@@ -125,7 +135,7 @@ def encoding(
 
     Args:
         ffmpeg: the program.
-        path: of the film, ending with .mp4 or .gif.
+        path: file of the film, ending with .mp4 or .gif.
         size: width and height of the frames [px]; even numbers for MP4.
         rate: frames a second.
 
@@ -133,27 +143,10 @@ def encoding(
         ConfigurationError: ffmpeg cannot write the film; with its last line.
     """
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    raw = [
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        f"{size[0]}x{size[1]}",
-        "-r",
-        f"{rate:g}",
-        "-i",
-        "-",
-    ]
-    call = [
-        ffmpeg,
-        "-y",
-        "-v",
-        "error",
-        *raw,
-        *_options(path.suffix.removeprefix("."), rate),
-        str(partial),
-    ]
+    width, height = size
+    raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate:g} -i -".split()
+    options = _options(path.suffix.removeprefix("."), rate)
+    call = [ffmpeg, "-y", "-v", "error", *raw, *options, str(partial)]
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
             call,
@@ -202,10 +195,10 @@ def _failure(
     """Return the error of a failed call of ffmpeg, with the last line of its output."""
     code = process.wait()
     complaints.seek(0)
-    last = complaints.read().decode(errors="replace").rstrip().rpartition("\n")[2].strip()
-    return ConfigurationError(
-        f"ffmpeg cannot write {path}: {last or f'it ended with exit code {code}'}"
-    )
+    output = complaints.read().decode(errors="replace").rstrip()
+    last_line = output.rpartition("\n")[2].strip()
+    reason = last_line or f"it ended with exit code {code}"
+    return ConfigurationError(f"ffmpeg cannot write {path}: {reason}")
 
 
 def draw_snapshots(run: LoggedRun) -> Figure:
@@ -214,10 +207,10 @@ def draw_snapshots(run: LoggedRun) -> Figure:
     panels = figure.subplots(2, SNAPSHOT_COUNT // 2).ravel()
     for axes in panels:
         axes.set_axis_off()
+    first_lap = run.ball[: _lap(run) + 1]
+    instants = snapshot_instants(first_lap, SNAPSHOT_COUNT)
     with Replay(run, fineness=2.0) as replay:
-        for axes, k in zip(
-            panels, snapshot_instants(run.ball[: _lap(run) + 1], SNAPSHOT_COUNT), strict=False
-        ):
+        for axes, k in zip(panels, instants, strict=False):
             replay.place(k)
             axes.imshow(replay.overview(_trails(run, k)), interpolation="antialiased")
             axes.set_title(f"{run.track.time[k]:.2f} s")
@@ -235,77 +228,117 @@ class _Board:
     """A frame around the two pictures: its background is drawn once, the error's line and the numbers in each frame."""
 
     def __init__(self, run: LoggedRun) -> None:
-        self._run, self._colour, self._error = run, _colour(run), run.track.error()
+        self._run = run
+        self._colour = _colour(run)
+        self._error = run.track.error()
         with figure_style():
-            self._figure = figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
-            self._canvas = cast("Any", FigureCanvasAgg(figure))
-            title = figure.text(
-                0.01,
-                1 - HEAD / 2 / HEIGHT,
-                _title(run),
-                va="center",
-                fontsize=TYPE,
-                fontweight="bold",
-            )
-            title.set_fontsize(TYPE * min(1.0, 0.98 * WIDTH / title.get_window_extent().width))
-            self._axes = figure.add_axes((0.11, 0.1, 0.865, 0.225))
+            self._figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
+            self._canvas = cast("Any", FigureCanvasAgg(self._figure))
+            self._write_title()
+            self._axes = self._figure.add_axes((0.11, 0.1, 0.865, 0.225))
             self._prepare_axes()
-            left, top = VIEW_WIDTH / WIDTH + 0.02, 1 - (HEAD + CAMERA_HEIGHT + 10) / HEIGHT
-            below: dict[str, Any] = {"fontsize": TYPE, "va": "top"}
-            figure.text(left, top, "the camera's view", **below)
-            self._numbers = figure.text(
-                left, top - 0.06, "", family="monospace", animated=True, **below
-            )
-            lines = [
-                mpl.lines.Line2D([], [], color=self._colour, linewidth=3, label="ball, so far"),
-                mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label=_desired(run)),
-            ]
-            figure.legend(
-                handles=lines, loc="upper left", bbox_to_anchor=(left - 0.015, top - 0.145), frameon=False,
-                fontsize=TYPE, handlelength=1.2, borderpad=0.0, labelspacing=0.2,
-            )  # fmt: skip
+            self._prepare_text()
             self._canvas.draw()
-            self._background = self._canvas.copy_from_bbox(figure.bbox)
+            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def _write_title(self) -> None:
+        """Write the title as large as its line allows."""
+        title = self._figure.text(
+            0.01,
+            1 - HEAD / 2 / HEIGHT,
+            _title(self._run),
+            va="center",
+            fontsize=TYPE,
+            fontweight="bold",
+        )
+        width = title.get_window_extent().width
+        title.set_fontsize(TYPE * min(1.0, 0.98 * WIDTH / width))
+
+    def _prepare_text(self) -> None:
+        """Write what is below the camera's picture: its title, the place of the numbers, a legend of the trails."""
+        left = VIEW_WIDTH / WIDTH + 0.02
+        top = 1 - (HEAD + CAMERA_HEIGHT + 10) / HEIGHT
+        below: dict[str, Any] = {"fontsize": TYPE, "va": "top"}
+        self._figure.text(left, top, "the camera's view", **below)
+        self._numbers = self._figure.text(
+            left,
+            top - 0.06,
+            "",
+            family="monospace",
+            animated=True,
+            **below,
+        )
+        ball = mpl.lines.Line2D([], [], color=self._colour, linewidth=3, label="ball, so far")
+        desired = mpl.lines.Line2D(
+            [],
+            [],
+            color=REFERENCE_HEX,
+            linewidth=2,
+            label=_desired(self._run),
+        )
+        self._figure.legend(
+            handles=[ball, desired],
+            loc="upper left",
+            bbox_to_anchor=(left - 0.015, top - 0.145),
+            frameon=False,
+            fontsize=TYPE,
+            handlelength=1.2,
+            borderpad=0.0,
+            labelspacing=0.2,
+        )
 
     def compose(self, replay: Replay, k: int) -> ByteArray:
         """Return the frame of period `k`, (HEIGHT, WIDTH, 3)."""
-        run = self._run
         replay.place(k)
-        self._canvas.restore_region(self._background)
-        time = run.track.time
-        self._line.set_data(time[: k + 1], self._error[: k + 1])
-        self._now.set_data(time[k : k + 1], self._error[k : k + 1])
-        self._numbers.set_text(
-            f"time {time[k]:6.2f} s\nerror {self._error[k]:5.1f} {run.track.error_unit[0]}"
-        )
-        for artist in (self._line, self._now, self._numbers):
-            self._figure.draw_artist(artist)
+        self._draw_error(k)
         frame: ByteArray = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-        view = cv2.resize(
-            replay.overview(_trails(run, k)),
-            (VIEW_WIDTH, VIEW_HEIGHT),
-            interpolation=cv2.INTER_AREA,
-        )
+        overview = replay.overview(_trails(self._run, k))
+        view_size = (VIEW_WIDTH, VIEW_HEIGHT)
+        view = cv2.resize(overview, view_size, interpolation=cv2.INTER_AREA)
         frame[HEAD : HEAD + VIEW_HEIGHT, :VIEW_WIDTH] = view
-        raw = replay.camera_view()
-        scale = min(SIDE / raw.shape[1], CAMERA_HEIGHT / raw.shape[0])
-        seen = cv2.resize(raw, (round(scale * raw.shape[1]), round(scale * raw.shape[0])))
-        frame[HEAD : HEAD + seen.shape[0], VIEW_WIDTH : VIEW_WIDTH + seen.shape[1]] = seen
+        image = replay.camera_view()
+        height, width, _ = image.shape
+        scale = min(SIDE / width, CAMERA_HEIGHT / height)
+        fitted = cv2.resize(image, (round(scale * width), round(scale * height)))
+        height, width, _ = fitted.shape
+        frame[HEAD : HEAD + height, VIEW_WIDTH : VIEW_WIDTH + width] = fitted
         return frame
 
+    def _draw_error(self, k: int) -> None:
+        """Draw the error up to period `k` and its numbers over the background."""
+        time = self._run.track.time
+        unit, _ = self._run.track.error_unit
+        self._canvas.restore_region(self._background)
+        self._line.set_data(time[: k + 1], self._error[: k + 1])
+        self._now.set_data(time[k : k + 1], self._error[k : k + 1])
+        self._numbers.set_text(f"time {time[k]:6.2f} s\nerror {self._error[k]:5.1f} {unit}")
+        for artist in (self._line, self._now, self._numbers):
+            self._figure.draw_artist(artist)
+
     def _prepare_axes(self) -> None:
-        axes, track, band = self._axes, self._run.track, self._run.track.settling_band
+        axes = self._axes
+        track = self._run.track
+        band = track.settling_band
         positive = self._error[np.isfinite(self._error) & (self._error > 0.0)]
         if len(positive):
             plain_logarithms(axes)
-            axes.set_ylim(
-                np.fmin(0.8 * positive.min(), 0.6 * band), 1.3 * np.fmax(positive.max(), band)
-            )
-        axes.set_xlim(track.time[0], max(float(track.time[-1]), track.time[0] + 1e-3))
+            # The band is NaN where the table has none: `fmin` and `fmax` then leave it out.
+            low = np.fmin(0.8 * positive.min(), 0.6 * band)
+            high = 1.3 * np.fmax(positive.max(), band)
+            axes.set_ylim(low, high)
+        first = track.time[0]
+        axes.set_xlim(first, max(float(track.time[-1]), first + 1e-3))
         mark_settling_band(axes, track)
         for line in axes.get_lines():
-            axes.annotate(str(line.get_label()), (0.995, band), xycoords=("axes fraction", "data"), fontsize=TYPE - 2,
-                          color="0.3", ha="right", va="bottom")  # fmt: skip
+            axes.annotate(
+                str(line.get_label()),
+                (0.995, band),
+                xycoords=("axes fraction", "data"),
+                fontsize=TYPE - 2,
+                color="0.3",
+                ha="right",
+                va="bottom",
+            )
         axes.tick_params(labelsize=TYPE - 2)
         axes.set_xlabel("time [s]", fontsize=TYPE)
         axes.set_ylabel(f"error [{track.error_unit[0]}]", fontsize=TYPE)
@@ -323,15 +356,16 @@ def _colour(run: LoggedRun) -> str:
 def _trails(run: LoggedRun, k: int) -> list[Trail]:
     """Return the desired path, or a cross at a fixed target, and the ball's path up to period `k`."""
     red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(_colour(run)))
-    desired = (
-        run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
-    )
-    cross = [desired[0] + np.stack([-arm, arm]) for arm in CROSS * np.eye(3)]
-    lines = cross if run.track.point_to_point else [desired]
-    return [
-        *(Trail(line, REFERENCE_COLOUR, 2) for line in lines),
-        Trail(run.ball[: k + 1], (red, green, blue), 3),
-    ]
+    # A moved camera sees the desired path at another place.
+    camera_moved = k >= run.moved_from
+    seen = slice(run.moved_from, None) if camera_moved else slice(run.moved_from)
+    desired = run.reference[seen]
+    lines = [desired]
+    if run.track.point_to_point:
+        lines = [desired[0] + np.stack([-arm, arm]) for arm in CROSS * np.eye(3)]
+    trails = [Trail(line, REFERENCE_COLOUR, 2) for line in lines]
+    trails.append(Trail(run.ball[: k + 1], (red, green, blue), 3))
+    return trails
 
 
 def _desired(run: LoggedRun) -> str:
@@ -348,32 +382,47 @@ def snapshot_instants(ball: FloatArray, count: int) -> list[int]:
         count: how many periods are wanted, two or more; there are fewer if the run has fewer.
     """
     least = MIN_ADVANCE * float(np.linalg.norm(np.ptp(ball, axis=0)))
-    way, place, count = np.zeros(len(ball)), ball[0], min(count, len(ball))
-    for k, point in enumerate(ball):
-        advance = float(np.linalg.norm(point - place))
-        counts = advance > least
-        way[k] = way[k - 1] + advance * counts if k else 0.0
-        place = point if counts else place
+    periods = len(ball)
+    count = min(count, periods)
+    way = np.zeros(periods)  # [m] from the start
+    place = ball[0]  # where the ball was when its way last grew
+    for k in range(1, periods):
+        advance = float(np.linalg.norm(ball[k] - place))
+        moves = advance > least
+        way[k] = way[k - 1] + advance * moves
+        if moves:
+            place = ball[k]
     if way[-1] == 0.0:  # the arm rests throughout
-        return [round(k) for k in np.linspace(0, len(ball) - 1, count)]
+        return [round(k) for k in np.linspace(0, periods - 1, count)]
+    # Rounding must not put the last instant behind the end of the way.
+    wanted = np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12)
+    chosen = np.searchsorted(way, wanted)
+    # Where one period takes the ball far, several instants fall on it: they move to later periods,
+    # and at the end of the run to earlier ones.
     order = np.arange(count)
-    chosen = np.searchsorted(way, np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12))
-    apart = np.maximum.accumulate(chosen - order) + order  # where one period takes the ball far
-    return [int(k) for k in np.minimum(apart, len(ball) - count + order)]
+    different = np.maximum.accumulate(chosen - order) + order
+    return [int(k) for k in np.minimum(different, periods - count + order)]
 
 
 def _lap(run: LoggedRun) -> int:
     """Return the period in which the reference is back where it began; the last one if it never is."""
     distance = np.linalg.norm(run.reference - run.reference[0], axis=1)
+    last = len(distance) - 1
     away = np.flatnonzero(distance > 0.5 * distance.max())
+    if not len(away):
+        return last
     back = np.flatnonzero(distance <= CLOSED * distance.max())
-    after = back[back > away[0]] if len(away) else back[:0]
-    return int(after[0]) if len(after) else len(distance) - 1
+    returned = back[back > away[0]]
+    return int(returned[0]) if len(returned) else last
 
 
 def _title(run: LoggedRun) -> str:
     row = run.track.row
+    plant = row["plant"]
     robot = str(row.get("robot", DEFAULT_ROBOT))
-    arm = "" if robot == DEFAULT_ROBOT else f", {short_name(robot)}"
-    mismatch = FROM_TWIN if run.robot.twin and row["mismatch"] == "none" else row["mismatch"]
-    return f"{row['controller']}: {row['task']} on {row['plant']}{arm}, mismatch {mismatch}, seed {row['seed']}"
+    if robot != DEFAULT_ROBOT:
+        plant = f"{plant}, {short_name(robot)}"
+    mismatch = row["mismatch"]
+    if run.robot.twin and mismatch == "none":
+        mismatch = FROM_TWIN
+    return f"{row['controller']}: {row['task']} on {plant}, mismatch {mismatch}, seed {row['seed']}"

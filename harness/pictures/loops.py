@@ -1,5 +1,6 @@
 """Pictures of analysed loops: Bode, Nyquist, sensitivity, step, limits of gain over latency; and a page of them."""
 
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -24,13 +25,14 @@ from servobench.harness.pictures.style import (
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_atomically
 
-PAGE, TEMPLATE = "analyse.html", "loops.html"
+PAGE = "analyse.html"
+TEMPLATE = "loops.html"
 FIGURES = "figures"
 LATENCIES: FloatArray = np.linspace(0.0, 0.5, 21)  # [s]
-FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # on the command
-# M_s at the edges of the colours; above 2 a loop is hardly robust
+FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # [1] factors on the command
+# [1] M_s at the edges of the colours; above 2 a loop is hardly robust.
 PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)
-NYQUIST_REACH = 2.5  # of the axes
+NYQUIST_REACH = 2.5  # [1] length of the negative axes of a Nyquist plot
 COLUMNS = 3
 
 
@@ -40,17 +42,20 @@ def draw_loops(loops: Sequence[LoopAnalysis]) -> Figure:
     (magnitude, nyquist, peaks), (phase, step, limits) = figure.subplots(2, 3)
     styles = method_styles([loop.name for loop in loops])
     for loop in loops:
-        style, response = styles[loop.name], loop.response
-        L, frequency = response.at_feature(), response.frequency
+        style = styles[loop.name]
+        frequency = loop.response.frequency
+        L = loop.response.at_feature()
         look = style.line_arguments(len(frequency))
         for i, curve in enumerate(loci(L).T):
-            magnitude.plot(frequency, np.abs(curve), label=None if i else loop.name, **look)
+            label = loop.name if i == 0 else None  # the loci of a loop share an entry of the legend
+            magnitude.plot(frequency, np.abs(curve), label=label, **look)
             phase.plot(frequency, _falling_phase(curve), **look)
             nyquist.plot(curve.real, curve.imag, **(look | {"marker": ""}))
         peaks.plot(frequency, largest_gain(sensitivity(L)), **look)
-        time = np.arange(len(loop.step)) * loop.arm.period
-        for curve in loop.step.T if loop.stable else ():
-            step.plot(time, curve, **style.line_arguments(len(time)))
+        if loop.stable:
+            time = np.arange(len(loop.step)) * loop.arm.period
+            for curve in loop.step.T:
+                step.plot(time, curve, **style.line_arguments(len(time)))
         limits.plot(
             1000.0 * LATENCIES,
             loop.gain_limits(LATENCIES.tolist()),
@@ -74,7 +79,7 @@ def draw_loops(loops: Sequence[LoopAnalysis]) -> Figure:
 
 def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
     """Draw M_s over gain and latency, a panel for each loop."""
-    rows = -(-len(loops) // COLUMNS)
+    rows = math.ceil(len(loops) / COLUMNS)
     columns = min(len(loops), COLUMNS)
     figure = Figure(figsize=(3.6 * columns + 0.8, 2.9 * rows + 0.4), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
@@ -84,12 +89,26 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
         limits = loop.gain_limits(LATENCIES.tolist())
         unstable = FACTORS[:, None] >= limits[None, :]
         axes.pcolormesh(
-            1000.0 * LATENCIES, FACTORS, np.where(unstable, np.nan, peaks), norm=norm, cmap="viridis_r",
-            shading="nearest", rasterized=True,
-        )  # fmt: skip
+            1000.0 * LATENCIES,
+            FACTORS,
+            np.where(unstable, np.nan, peaks),
+            norm=norm,
+            cmap="viridis_r",
+            shading="nearest",
+            rasterized=True,
+        )
         axes.plot(1000.0 * LATENCIES, limits, color="black", linewidth=1.4)
-        axes.plot(1000.0 * loop.arm.latency, 1.0, color="white", marker="X", markersize=9, markeredgecolor="black",
-                  clip_on=False, zorder=10)  # fmt: skip
+        # The cross marks the loop as it is: its own latency, the command as computed.
+        axes.plot(
+            1000.0 * loop.arm.latency,
+            1.0,
+            color="white",
+            marker="X",
+            markersize=9,
+            markeredgecolor="black",
+            clip_on=False,
+            zorder=10,
+        )
         axes.set(title=loop.name, ylim=(FACTORS[0], FACTORS[-1]))
         axes.set(xlabel="latency of the camera [ms]", ylabel="factor on the command")
         axes.label_outer()
@@ -111,21 +130,17 @@ def write_pictures(
     """
     with figure_style():
         figures = {"loops": draw_loops(loops), "stability_map": draw_stability_map(loops)}
-    paths = [
-        path
-        for name, figure in figures.items()
-        for path in save_figure(figure, folder / FIGURES / name)
-    ]
-    drawings = {name: drawing_of(figure)._asdict() for name, figure in figures.items()}
-    text = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8")).substitute(
-        {
-            f"{name}_{key}": value
-            for name, drawing in drawings.items()
-            for key, value in drawing.items()
-        },
-        table=table.rename(columns=one_line).to_html(index=False, border=0),
-        legend=escape(legend),
-    )
+    paths: list[Path] = []
+    for name, figure in figures.items():
+        paths += save_figure(figure, folder / FIGURES / name)
+    fields: dict[str, object] = {}
+    for name, figure in figures.items():
+        drawing = drawing_of(figure)._asdict()
+        fields |= {f"{name}_{key}": value for key, value in drawing.items()}
+    fields["table"] = table.rename(columns=one_line).to_html(index=False, border=0)
+    fields["legend"] = escape(legend)
+    template = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8"))
+    text = template.substitute(fields)
     page = folder / PAGE
     write_atomically(page, lambda path: path.write_text(text, encoding="utf-8"))
     return [page, *paths]
@@ -165,5 +180,11 @@ def _finish_nyquist(axes: Axes) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     axes.plot(np.cos(angle), np.sin(angle), color="0.6", linewidth=0.9)
     axes.plot(-1.0, 0.0, color="black", marker="+", markersize=11, markeredgewidth=1.6)
-    axes.set(title="Nyquist plot of L", xlabel="real part of the loci of L", ylabel="imaginary part", aspect="equal",
-             xlim=(-NYQUIST_REACH, 1.0), ylim=(-NYQUIST_REACH, 1.0))  # fmt: skip
+    axes.set(
+        title="Nyquist plot of L",
+        xlabel="real part of the loci of L",
+        ylabel="imaginary part",
+        aspect="equal",
+        xlim=(-NYQUIST_REACH, 1.0),
+        ylim=(-NYQUIST_REACH, 1.0),
+    )

@@ -36,23 +36,21 @@ from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
-# And where a run without a value stands, over the largest value
-SETTLING, NEVER = ("settling_time_s", 1.3)
-# of which each shows the metrics that name it
-FIGURES: Final = ("settling", "effort", "smoothness")
+SETTLING: Final = "settling_time_s"
+NEVER: Final = 1.3  # [1] place of a run that never settled, over the largest settling time
+FIGURES: Final = ("settling", "effort", "smoothness")  # each shows the metrics that name it
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
 MAX_RANGE: Final = 1e6  # largest over smallest value that an axis shows
-NAME_LETTERS: Final = 20  # of a controller's name at an axis, for each column of a layout
-LETTERS: Final = 16.0  # of a label in an inch
+NAME_LETTERS: Final = 20  # letters of a controller's name at an axis, for each column of a layout
+LETTERS: Final = 16.0  # letters of a label in an inch
 NUMBERS: Final = 0.25  # [in] next to the names
-LEAST_ROWS: Final = 4  # controllers for which a panel has room
-SPREAD = (
-    0.5  # share of the distance between two places over which the marks of the methods are spread
-)
-UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
-LINE_LETTERS: Final = 30  # of a line of text within a panel
+MIN_ROWS: Final = 4  # controllers for which a panel has room
+# [1] Share of the distance between two places over which the marks of the methods are spread.
+SPREAD = 0.5
+UPPER: Final = 0.97  # [1] share of a panel's height at which the mark of an infinite value stands
+LINE_LETTERS: Final = 30  # letters of a line of text within a panel
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 
@@ -74,14 +72,13 @@ def draw_measures(
     ]
     if not rows:
         return None
-    alone = runs["task"].nunique() == 1
-    figure = (
-        _draw_one_task(runs, rows, styles, layout)
-        if alone
-        else _draw_each_task(runs, rows, styles, layout)
-    )
-    notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
-    notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
+    draw = _draw_one_task if runs["task"].nunique() == 1 else _draw_each_task
+    figure = draw(runs, rows, styles, layout)
+    notes = []
+    if runs.groupby(["task", "controller"]).size().max() > 1:
+        notes.append("bar: median")
+    if (runs["status"] != COMPLETED).any():
+        notes.append("hollow: the run ended early")
     if _never(runs, rows[0]).any():
         notes.append("at the right edge and counted: never settled")
     if notes:
@@ -92,8 +89,9 @@ def draw_measures(
 
 def _draw_each_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout: Layout) -> Figure:
     """Draw measures of several tasks: a row a measure, a column a task."""
-    tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
-    height = 0.55 + LINE * max(LEAST_ROWS, len(names))
+    tasks = runs["task"].unique().tolist()
+    names = runs["controller"].unique().tolist()
+    height = 0.55 + LINE * max(MIN_ROWS, len(names))
     figure = Figure(figsize=(layout.width, 0.65 + len(rows) * height), layout="constrained")
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, row in zip(parts, rows, strict=True):
@@ -110,14 +108,14 @@ def _draw_one_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout: 
     """Draw metrics of one task in rows of as many panels as the layout has columns."""
     names = runs["controller"].unique().tolist()
     rows = [row for row in rows if row != SETTLING or _moves(runs).any()] or rows[:1]
-    beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
+    longest_name = max(len(_short_name(name, layout)) for name in names)
+    beside = LETTER * longest_name + NUMBERS
     letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
-    words = [textwrap.fill(_label(row, runs), letters) for row in rows]
-    height = 0.4 + LINE * (
-        max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names))
-    )
+    labels = [textwrap.fill(_label(row, runs), letters) for row in rows]
+    label_lines = max(text.count("\n") + 1 for text in labels)
+    height = 0.4 + LINE * (label_lines + max(MIN_ROWS, len(names)))
     figure, panels = panel_grid(len(rows), height, layout, head=0.35)
-    for axes, row, label in zip(panels, rows, words, strict=True):
+    for axes, row, label in zip(panels, rows, labels, strict=True):
         _draw_dots(axes, runs, names, styles, row)
         _name_rows(axes, names, layout)
         axes.set_xlabel(label)
@@ -130,9 +128,11 @@ def _name_rows(axes: Axes, names: Sequence[str], layout: Layout) -> None:
 
 
 def _short_name(name: str, layout: Layout) -> str:
-    """Return the end of a name, which says more than its begin, in as many letters as there is room for."""
+    """Return the end of a name, which says more than its beginning, in as many letters as there is room for."""
     letters = NAME_LETTERS * min(2, layout.columns)
-    return name if len(name) <= letters else f"…{name[1 - letters :]}"
+    if len(name) <= letters:
+        return name
+    return f"…{name[1 - letters :]}"
 
 
 def draw_step_times(
@@ -142,26 +142,29 @@ def draw_step_times(
 
     Steps that take longer than the control period are marked and, on a wide sheet, counted.
     """
-    names = list(dict.fromkeys(name for ensembles in tasks.values() for name in ensembles))
-    times = {
-        name: 1e-3 * np.concatenate([e[name].step_time for e in tasks.values() if name in e])
-        for name in names
-    }
-    known = {name: values for name, values in times.items() if len(values)}
+    known = _step_times(tasks)
     if not known:
         return None
     periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
     limit = 1e3 * max([period for period in periods if math.isfinite(period)], default=math.nan)
-    # Fine pictures have slightly wider bold letters
+    # Bold letters are slightly wider in a fine picture; the strip at the right is for them.
     inside = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.98, 1.0))
     figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout=inside)
     axes = figure.add_subplot()
     top = 1.4 * max(float(np.max(values)) for values in known.values())
     for i, (name, values) in enumerate(known.items()):
         words = _draw_times(axes, i, values, limit, styles[name])
+        too_slow = "\n" in words
         if layout.wide:
-            axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
-                          fontweight="bold" if "\n" in words else None, linespacing=1.0)  # fmt: skip
+            axes.annotate(
+                words,
+                (1.01, i),
+                xycoords=("axes fraction", "data"),
+                va="center",
+                fontsize=TEXT - 0.5,
+                fontweight="bold" if too_slow else None,
+                linespacing=1.0,
+            )
     above: dict[str, Any] = {
         "va": "bottom",
         "fontsize": TEXT - 0.5,
@@ -185,6 +188,16 @@ def draw_step_times(
     return figure
 
 
+def _step_times(tasks: Mapping[str, Ensembles]) -> dict[str, FloatArray]:
+    """Return the times of all steps of each controller [ms] that has some."""
+    parts: dict[str, list[FloatArray]] = {}
+    for ensembles in tasks.values():
+        for name, ensemble in ensembles.items():
+            parts.setdefault(name, []).append(ensemble.step_time)
+    times = {name: 1e-3 * np.concatenate(own) for name, own in parts.items()}
+    return {name: values for name, values in times.items() if len(values)}
+
+
 def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> str:
     """Draw the times of a controller's steps [ms] in line `i`, and return the numbers that belong beside it."""
     low, first, middle, third, high = np.percentile(values, PERCENTILES)
@@ -192,17 +205,26 @@ def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: Met
     axes.plot(
         [first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45
     )
-    axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
-              markerfacecolor=style.face)  # fmt: skip
-    shown = [
-        f"{1e3 * time:.0f} µs" if time < 0.9995 else f"{time:.3g} ms"
-        for time in (middle, high, values.max())
-    ]
-    words = ", ".join(shown)
-    if values.max() > limit:
-        axes.plot(values.max(), i, color="black", marker="X", markersize=6.5, linestyle="")
+    axes.plot(
+        middle,
+        i,
+        color=style.colour,
+        marker=style.marker or "o",
+        markersize=6.0,
+        markeredgecolor="black",
+        markerfacecolor=style.face,
+    )
+    largest = values.max()
+    words = ", ".join(_time_in_words(time) for time in (middle, high, largest))
+    if largest > limit:
+        axes.plot(largest, i, color="black", marker="X", markersize=6.5, linestyle="")
         words += f"\n{np.count_nonzero(values > limit)} of {len(values)} too slow"
     return words
+
+
+def _time_in_words(time: float) -> str:
+    """Return a time [ms] with its unit; a time that rounds to less than 1 ms in µs."""
+    return f"{1e3 * time:.0f} µs" if time < 0.9995 else f"{time:.3g} ms"
 
 
 def _label(column: str, runs: pd.DataFrame) -> str:
@@ -225,34 +247,52 @@ def _draw_dots(
     axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str
 ) -> None:
     """Draw a measure of the runs of one task."""
-    values, never = (
-        comparison.shown_unit(column, runs)[1] * runs[column].astype(float),
-        _never(runs, column),
-    )
+    _, factor = comparison.shown_unit(column, runs)
+    values = factor * runs[column].astype(float)
+    never = _never(runs, column)
+    # A logarithmic axis has no room for tiny values: they stand at its lower end.
     floor = values.max() / MAX_RANGE
     values = values.where(~((values > 0.0) & (values < floor)), floor)
     if column == SETTLING:
         values = values.where(_moves(runs) & ~never)
     if values.isna().all() and not never.any():
         axes.tick_params(axis="x", bottom=False, labelbottom=False)
-        axes.text(0.5, 0.5, "does not apply", transform=axes.transAxes, ha="center", va="center", color="0.4",
-                  fontsize=TEXT - 1.0)  # fmt: skip
+        axes.text(
+            0.5,
+            0.5,
+            "does not apply",
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+            color="0.4",
+            fontsize=TEXT - 1.0,
+        )
     edge = _limit(axes, values, NEVER if never.any() else 1.06)
+    places = values.where(~never, edge)
     for i, name in enumerate(names):
-        own, style = runs["controller"] == name, styles[name]
+        own = runs["controller"] == name
+        style = styles[name]
         for completed in (True, False):
             chosen = own & ((runs["status"] == COMPLETED) == completed)
-            points = values.where(~never, edge)[chosen].dropna().to_numpy()
-            if (
-                len(points) == 0
-            ):  # an empty line that is not clipped would count as a mark at the origin
+            points = places[chosen].dropna().to_numpy()
+            # An empty line that is not clipped would count as a mark at the origin.
+            if len(points) == 0:
                 continue
-            face = style.colour if completed else "none"
-            axes.plot(points, np.full(len(points), i), color=style.colour, marker=style.marker or "o", linestyle="",
-                      markersize=4.5, markerfacecolor=face, markeredgewidth=0.7, alpha=0.55, clip_on=False)  # fmt: skip
-        middle = (
-            values[own].fillna(math.inf).median() if column == SETTLING else values[own].median()
-        )
+            axes.plot(
+                points,
+                np.full(len(points), i),
+                color=style.colour,
+                marker=style.marker or "o",
+                linestyle="",
+                markersize=4.5,
+                markerfacecolor=style.colour if completed else "none",
+                markeredgewidth=0.7,
+                alpha=0.55,
+                clip_on=False,
+            )
+        # A move that never settled counts in the median as one that settles after infinite time.
+        judged = values[own].fillna(math.inf) if column == SETTLING else values[own]
+        middle = judged.median()
         if own.sum() > 1 and math.isfinite(middle):
             axes.plot(
                 middle,
@@ -264,17 +304,26 @@ def _draw_dots(
                 linestyle="",
             )
         if never[own].any():
-            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="left", va="center", xytext=(5, 0),
-                          textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
+            axes.annotate(
+                f"{never[own].sum()} of {own.sum()}",
+                (edge, i),
+                ha="left",
+                va="center",
+                xytext=(5, 0),
+                textcoords="offset points",
+                fontsize=TEXT - 2.0,
+            )
 
 
 def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
     """Show values of at least 0, linear with `room` over the largest one or logarithmic; return the upper end."""
-    largest, least = float(values.max()), float(values.min())
+    largest = float(values.max())
+    least = float(values.min())
     if least > 0.0 and largest / least > WIDE_RANGE:
         edge = largest * float((largest / least) ** 0.08)
+        margin = edge / largest
         plain_logarithms(axes, "x")
-        axes.set_xlim(least / (edge / largest), edge)
+        axes.set_xlim(least / margin, edge)
         return edge
     edge = largest * room if largest > 0.0 else 1.0
     axes.set_xlim(0.0, edge)
@@ -292,20 +341,34 @@ def draw_places(axes: Axes, places: Sequence[float], values: Curves, styles: Sty
         style = styles[name]
         shift = width * ((k + 0.5) / len(values) - 0.5)
         x = np.array(places, dtype=float) + shift
-        y, low, high = (
-            np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high")
-        )
+        y, low, high = _bounds(estimates)
         known = np.isfinite(y)
         if known.any():
-            y, top = y[known], float(np.max(y[known]))
+            y = y[known]
             below = y - np.where(np.isfinite(low), low, np.nan)[known]
-            # Out of the picture
-            above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y
+            outside = 10.0 * (1.0 + float(np.max(y)))  # a number above the picture
+            above = np.where(np.isinf(high[known]), outside, high[known]) - y
             axes.errorbar(
-                x[known], y, yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0), color=style.colour,
-                linestyle="none", marker=style.marker or "_", markersize=4.5, linewidth=1.2,
-                elinewidth=1.0, capsize=2.0, label=name,
-            )  # fmt: skip
+                x[known],
+                y,
+                yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0),
+                color=style.colour,
+                linestyle="none",
+                marker=style.marker or "_",
+                markersize=4.5,
+                linewidth=1.2,
+                elinewidth=1.0,
+                capsize=2.0,
+                label=name,
+            )
+
+
+def _bounds(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the values of estimates and the ends of their intervals, (k,) each."""
+    y = np.array([estimate.value for estimate in estimates])
+    low = np.array([estimate.low for estimate in estimates])
+    high = np.array([estimate.high for estimate in estimates])
+    return y, low, high
 
 
 def draw_curves(
@@ -316,38 +379,51 @@ def draw_curves(
     Methods with the same curve share one line, and the panel names them. An infinite estimate is a mark at the upper
     edge `top`.
     """
-    x, groups = np.array(places, dtype=float), same_curves(values)
+    x = np.array(places, dtype=float)
+    groups = same_curves(values)
     for names in groups:
-        first, style = names[0], styles[names[0]]
-        y, low, high = (
-            np.array([getattr(e, part) for e in values[first]]) for part in ("value", "low", "high")
-        )
+        first, *others = names
+        style = styles[first]
+        y, low, high = _bounds(values[first])
         known = ~np.isnan(y)
         if not known.any():
             continue
-        edges = np.nan_to_num(
-            np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=1.05 * top
-        )
+        interval = np.vstack([np.where(np.isnan(low), y, low), high])[:, known]
+        edges = np.nan_to_num(interval, posinf=1.05 * top)
         axes.fill_between(x[known], *edges, color=style.colour, alpha=0.12, linewidth=0.0)
         _draw_line(axes, x[known], y[known], style, first, top)
-        for name in names[1:]:
+        for name in others:
             axes.plot([], [], label=name, **styles[name].line_arguments(1))
-        if len(names) > 1:
+        if others:
             shared = "all methods" if len(groups) == 1 else ", ".join(names)
-            constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
-            words = textwrap.fill(f"one line{constant}: {shared}", LINE_LETTERS)
-            upper = float(np.nanmean(np.minimum(y, top))) < top / 2.0
-            level, side = (0.96, "top") if upper else (0.04, "bottom")
-            axes.text(0.03, level, words, transform=axes.transAxes, va=side, fontsize=TEXT - 2.0,
-                      bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0})  # fmt: skip
+            _name_shared_line(axes, shared, y, top)
     axes.set_ylim(-0.02 * top, top)
+
+
+def _name_shared_line(axes: Axes, methods: str, y: FloatArray, top: float) -> None:
+    """Write which methods share a line through `y`, (k,), into that half of the panel that it leaves free."""
+    constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
+    words = textwrap.fill(f"one line{constant}: {methods}", LINE_LETTERS)
+    upper_half_free = float(np.nanmean(np.minimum(y, top))) < top / 2.0
+    level, side = (0.96, "top") if upper_half_free else (0.04, "bottom")
+    axes.text(
+        0.03,
+        level,
+        words,
+        transform=axes.transAxes,
+        va=side,
+        fontsize=TEXT - 2.0,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
+    )
 
 
 def same_curves(values: Curves) -> list[list[str]]:
     """Return the methods, those with the same values and intervals everywhere together."""
     groups: dict[str, list[str]] = {}
     for name, estimates in values.items():
-        groups.setdefault(repr([(e.value, e.low, e.high) for e in estimates]), []).append(name)
+        # Texts of numbers, as NaN does not equal itself.
+        curve = repr([(e.value, e.low, e.high) for e in estimates])
+        groups.setdefault(curve, []).append(name)
     return list(groups.values())
 
 
@@ -366,8 +442,9 @@ def _draw_line(
         x, shown, label=name, linestyle=style.line, marker=style.marker, markevery=~beyond, **look
     )
     if beyond.any():
-        axes.plot(x[beyond], np.full(np.count_nonzero(beyond), UPPER * top), linestyle="none", marker=6,
-                  **(look | {"markersize": 6.5}))  # fmt: skip
+        level = np.full(np.count_nonzero(beyond), UPPER * top)
+        larger = look | {"markersize": 6.5}
+        axes.plot(x[beyond], level, linestyle="none", marker=mpl.markers.CARETUP, **larger)
 
 
 def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -> Figure | None:
@@ -380,8 +457,11 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -
         shares = {
             key: comparison.settled_share(own) for key, own in part.groupby(["controller", "size"])
         }
-        names, sizes = part["controller"].unique(), sorted(part["size"].unique())
-        values = {name: [shares.get((name, size), NO_ESTIMATE) for size in sizes] for name in names}
+        sizes = sorted(part["size"].unique())
+        values = {
+            name: [shares.get((name, size), NO_ESTIMATE) for size in sizes]
+            for name in part["controller"].unique()
+        }
         draw_curves(axes, sizes, values, styles, top=104.0)
         axes.set_xlabel(label)
     label_rows(panels, "settled runs [%]")
@@ -395,29 +475,35 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     Where a sweep says along which axis a run stands, the axes are its own, and the numbers that vary at one place of
     an axis; else the mismatches are read, and runs without mismatch have size 0 on each axis.
     """
-    none = runs.head(0)
-    places = (
-        [runs]
-        if "axis" not in runs
-        else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
-    )
-    sweeps = {
-        label: runs.assign(size=factor * runs[name].astype(float))
-        for name, (label, factor) in varied_columns(runs.columns).items()
-        if is_numeric_dtype(runs[name]) and any(own[name].nunique() > 1 for own in places)
-    }
+    sweeps = _varied_settings(runs)
+    at_zero = runs.head(0)
     if "axis" not in runs or (runs["axis"].fillna("") == "").all():
-        none = runs[runs["mismatch"].isin(["none", comparison.FROM_TWIN])].assign(size=0.0)
+        without_mismatch = runs["mismatch"].isin(["none", comparison.FROM_TWIN])
+        at_zero = runs[without_mismatch].assign(size=0.0)
         runs = runs.assign(**runs["mismatch"].str.extract(SIZED_AXIS))
     along = runs[runs["axis"].fillna("") != ""]
     along = along.assign(size=along["magnitude"].astype(float))
     for (axis, unit), group in along.groupby(["axis", "unit"], sort=False):
-        name = str(axis).replace("_", " ")
-        sweeps[f"{name} [{unit}]" if unit else name] = (
-            pd.concat([none, group]) if len(none) else group
-        )
+        label = str(axis).replace("_", " ")
+        if unit:
+            label += f" [{unit}]"
+        sweeps[label] = pd.concat([at_zero, group]) if len(at_zero) else group
     return {
         label: part.dropna(subset=["size"])
         for label, part in sweeps.items()
         if part["size"].nunique() > 1
     }
+
+
+def _varied_settings(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each number that varies, at one place of an axis if there are axes, the runs with its `size`."""
+    places = [runs]
+    if "axis" in runs:
+        places = [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
+    sweeps = {}
+    for name, (label, factor) in varied_columns(runs.columns).items():
+        if not is_numeric_dtype(runs[name]):
+            continue
+        if any(own[name].nunique() > 1 for own in places):
+            sweeps[label] = runs.assign(size=factor * runs[name].astype(float))
+    return sweeps

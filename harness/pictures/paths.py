@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
@@ -20,6 +21,7 @@ from servobench.harness.pictures.style import (
     add_legend,
     divisions,
     mark_end,
+    way_along,
 )
 from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
 from servobench.plant.contract.checks import FloatArray
@@ -27,10 +29,12 @@ from servobench.plant.contract.checks import FloatArray
 COLUMNS: Final = 2
 SINGLE: Final = 3.6  # [in] width of the only view of a wide figure
 BESIDE: Final = 0.8  # [in] for the numbers beside a view
-LINE: Final = 0.17  # [in] of the legend
-SLIMMEST, TALLEST = 0.3, 1.0  # height of a view over its width
-ROOM: Final = 1.16  # of a view over the paths in it
-ARROW: Final = 0.06  # of a curve, from where to where an arrow shows its direction
+LINE: Final = 0.17  # [in] height of a line of the legend
+# [1] Least and largest height of a view over its width.
+SLIMMEST: Final = 0.3
+TALLEST: Final = 1.0
+ROOM: Final = 1.16  # [1] size of a view over that of the paths in it
+ARROW: Final = 0.06  # [1] share of a curve after which an arrow shows its direction
 # Labels of a feature in the frame of the camera.
 CAMERA_FRAME: Final = {
     "x_m": "x, to the right [m]",
@@ -58,11 +62,13 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
         return None
     blocks = _blocks(tasks, views)
     columns = min(COLUMNS, layout.columns, len(blocks))
-    rows = -(-len(blocks) // columns)
+    rows = math.ceil(len(blocks) / columns)
     lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
     ratios = [max(extent.ratio(view) for _, _, extent in line) for line in lines for view in views]
-    width = SINGLE if layout.wide and columns == 1 else layout.width / columns - BESIDE
-    lines_below = LINE * sum(len(tracks) for _, tracks, _ in blocks) * (0.1 if layout.wide else 1.0)
+    room = layout.width / columns - BESIDE  # [in] width of a view
+    width = SINGLE if layout.wide and columns == 1 else room
+    methods = sum(len(tracks) for _, tracks, _ in blocks)
+    lines_below = LINE * methods * (0.1 if layout.wide else 1.0)
     height = 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views)) + lines_below
     figure = Figure(figsize=(layout.width, height), layout="compressed")
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
@@ -73,10 +79,9 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
             _draw_view(axes, tracks, styles, view)
             extent.apply(axes, view, ratios[i])
             title = f"{heading}: {view.title}" if len(views) > 1 else heading
-            axes.set_title(textwrap.fill(title, round((layout.width / columns - BESIDE) / LETTER)))
-            if (
-                view is not views[-1] and views[views.index(view) + 1].across == view.across
-            ):  # one abscissa for both
+            axes.set_title(textwrap.fill(title, round(room / LETTER)))
+            below = views[views.index(view) + 1 :]
+            if below and below[0].across == view.across:  # one abscissa for both
                 axes.set_xlabel("")
                 axes.tick_params(labelbottom=False)
     for axes in grid.flat:
@@ -102,12 +107,14 @@ def _views(tracks: Tracks) -> list[View]:
     if features[:3] == list(CAMERA_FRAME):
         return [View("camera's view", 0, 1), View("from the side", 0, 2)]
     names = [name.rpartition("_")[0] for name in features]
-    if features[0].endswith(f"_{PIXELS}") and len(names) % 2 == 0:
-        return [
-            View(f"{names[i + 1]} over {names[i]}", i, i + 1)
-            for i in range(0, min(4, len(names)), 2)
-        ]
-    return [View(f"{names[i]} over {names[0]}", 0, i) for i in range(1, min(3, len(names)))]
+    image_points = features[0].endswith(f"_{PIXELS}") and len(names) % 2 == 0
+    if image_points:
+        pairs = [(i, i + 1) for i in range(0, min(4, len(names)), 2)]
+    else:
+        pairs = [(0, i) for i in range(1, min(3, len(names)))]
+    return [
+        View(f"{names[upright]} over {names[across]}", across, upright) for across, upright in pairs
+    ]
 
 
 class _Extent:
@@ -115,30 +122,38 @@ class _Extent:
 
     def __init__(self, tracks: Tracks, views: list[View]) -> None:
         whole = longest(tracks)
-        points = np.concatenate([*(_points(track, "true_feature_") for track in tracks.values()),
-                                 _points(whole, "reference_")])  # fmt: skip
+        paths = [_points(track, "true_feature_") for track in tracks.values()]
+        paths.append(_points(whole, "reference_"))
+        points = np.concatenate(paths)
         self._units = [name.rpartition("_")[2] for name in whole.features]
         self._middle = (points.max(axis=0) + points.min(axis=0)) / 2
         self._size = np.maximum(ROOM * np.ptp(points, axis=0), 1e-6)
+        wide = [float(self._size[view.across]) for view in views]
         tall = [float(self._size[view.upright]) / TALLEST for view in views if self._to_scale(view)]
-        self._across = max([*(float(self._size[view.across]) for view in views), *tall])
+        self._across = max([*wide, *tall])
 
     def _to_scale(self, view: View) -> bool:
         return self._units[view.across] == self._units[view.upright]
 
     def ratio(self, view: View) -> float:
         """Return height over width that a view needs."""
-        ratio = np.clip(self._size[view.upright] / self._across, SLIMMEST, TALLEST)
-        return float(ratio) if self._to_scale(view) else 0.6
+        if not self._to_scale(view):
+            return 0.6
+        return float(np.clip(self._size[view.upright] / self._across, SLIMMEST, TALLEST))
 
     def apply(self, axes: Axes, view: View, ratio: float) -> None:
         """Set the limits of a view whose height over width is given; lengths have the same scale both ways."""
-        to_scale, half = self._to_scale(view), self._across / 2
-        high = ratio * half if to_scale else self._size[view.upright] / 2
-        x, y = self._middle[view.across], self._middle[view.upright]
-        axes.set(xlim=(x - half, x + half), ylim=(y - high, y + high))
-        if to_scale:
+        half_width = self._across / 2
+        half_height = self._size[view.upright] / 2
+        if self._to_scale(view):
+            half_height = ratio * half_width
             axes.set_aspect("equal", adjustable="box")
+        x = self._middle[view.across]
+        y = self._middle[view.upright]
+        axes.set(
+            xlim=(x - half_width, x + half_width),
+            ylim=(y - half_height, y + half_height),
+        )
         if axes.get_ylabel() in CAMERA_FRAME.values() or self._units[0] == PIXELS:
             axes.invert_yaxis()
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
@@ -171,9 +186,9 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
 
 def _draw_direction(axes: Axes, reference: FloatArray) -> None:
     """Draw an arrow along a desired curve near its start."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
-    first, second = np.searchsorted(way, [ARROW * way[-1], 1.4 * ARROW * way[-1]])
-    if first < second < len(reference):
+    way = way_along(reference)
+    tail, head = np.searchsorted(way, [ARROW * way[-1], 1.4 * ARROW * way[-1]])
+    if tail < head < len(reference):
         look = {
             "arrowstyle": "-|>",
             "color": "black",
@@ -182,7 +197,7 @@ def _draw_direction(axes: Axes, reference: FloatArray) -> None:
             "shrinkA": 0,
             "shrinkB": 0,
         }
-        axes.annotate("", reference[second], reference[first], arrowprops=look, zorder=9)
+        axes.annotate("", reference[head], reference[tail], arrowprops=look, zorder=9)
 
 
 def _points(track: Track, kind: str) -> FloatArray:

@@ -31,10 +31,13 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import Robot
 
 JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
-SEEN_DEPTH = 0.05  # [m] behind a surface at which a trail still counts as in front: it begins within the ball
-MAX_APART = 0.01  # [m] of the ball from that of the rigid arm, up to which a film says nothing
+# [m] Depth behind a surface at which a trail still counts as visible: it begins within the ball.
+VISIBLE_DEPTH = 0.05
+# [m] Distance of the logged ball from that of the rigid arm up to which a film needs no remark.
+MAX_BALL_OFFSET = 0.01
 ROUNDING = 1e-6  # [s] by which an instant may lie outside a stretch
-HIDDEN_OPACITY = 0.3  # of the parts of a trail that are hidden
+HIDDEN_OPACITY = 0.3  # [1] opacity of the hidden parts of a trail
+SUBPIXEL_BITS = 4  # binary digits after the point in the coordinates that OpenCV draws
 
 
 class Trail(NamedTuple):
@@ -52,9 +55,8 @@ class LoggedRun:
     track: Track  # its row in the table of runs, and its steps
     robot: Robot  # by its maker's description
     model: HandEyeModel  # the true arm and camera
-    moved: (
-        HandEyeModel | None
-    )  # the same after the camera was moved in the middle of the run; None if it was not
+    # The same after the camera was moved in the middle of the run; None if it was not.
+    moved: HandEyeModel | None
     moved_from: int  # first period that the moved camera sees; the number of periods if none
     joint_position: FloatArray  # (k, n) [rad], as reported
     ball: FloatArray  # (k, 3) [m], base frame
@@ -91,21 +93,31 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
         wanted = f"wanted the {robot.arm.n} of a {robot.title}"
         raise ConfigurationError(f"run {run_id} has {len(names)} joint positions [rad]; {wanted}")
     model, moved = _true_model(row, robot)
-    q, ball = track.table[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
-    moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
+    q = track.table[names].to_numpy(dtype=np.float64)
+    true_feature = track.vectors("true_feature_")
+    moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, true_feature)
 
     def in_base(points: FloatArray) -> FloatArray:
-        before, after = points[:moved_from], points[moved_from:]
-        return np.concatenate([model.to_base(before), (moved or model).to_base(after)])
+        before = model.to_base(points[:moved_from])
+        after = (moved or model).to_base(points[moved_from:])
+        return np.concatenate([before, after])
 
-    reference, true = track.vectors("reference_"), in_base(ball)
-    apart = float(
-        np.nanmax(np.linalg.norm(model.to_base(model.feature(q)) - true, axis=1), initial=0.0)
-    )
-    if apart > MAX_APART:
+    ball = in_base(true_feature)
+    drawn_ball = model.to_base(model.feature(q))
+    offset = float(np.nanmax(np.linalg.norm(drawn_ball - ball, axis=1), initial=0.0))
+    if offset > MAX_BALL_OFFSET:
         why = "films have no play of gears, no flexible tool and no camera that turns"
-        remark(f"run {run_id}: the ball was up to {apart:.2g} m from where it is drawn, as {why}")
-    return LoggedRun(track, robot, model, moved, moved_from, q, true, in_base(reference))
+        remark(f"run {run_id}: the ball was up to {offset:.2g} m from where it is drawn, as {why}")
+    return LoggedRun(
+        track=track,
+        robot=robot,
+        model=model,
+        moved=moved,
+        moved_from=moved_from,
+        joint_position=q,
+        ball=ball,
+        reference=in_base(track.vectors("reference_")),
+    )
 
 
 def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:
@@ -118,12 +130,16 @@ def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:
     end = math.inf if length is None else begin + length
     inside = np.flatnonzero((time >= begin - ROUNDING) & (time <= end + ROUNDING))
     if not len(inside):
-        raise ConfigurationError(f"run {run.track.row['run_id']} has no instant from {begin:g} to {end:g} s: it goes "
-                                 f"from {time[0]:g} to {time[-1]:g} s")  # fmt: skip
+        run_id = run.track.row["run_id"]
+        raise ConfigurationError(
+            f"run {run_id} has no instant from {begin:g} to {end:g} s: it goes "
+            f"from {time[0]:g} to {time[-1]:g} s"
+        )
     part = slice(inside[0], inside[-1] + 1)
+    table = run.track.table.iloc[part].reset_index(drop=True)
     return replace(
         run,
-        track=Track(run.track.row, run.track.table.iloc[part].reset_index(drop=True)),
+        track=Track(run.track.row, table),
         moved_from=max(0, run.moved_from - int(inside[0])),
         joint_position=run.joint_position[part],
         ball=run.ball[part],
@@ -141,9 +157,10 @@ class Replay(AbstractContextManager["Replay"]):
             run: the logged run.
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
-        self._run, self._fineness = run, fineness
-        open_scene = load_engine(rendered_plant(str(run.track.row["plant"]))).scene
-        self._scene = open_scene(Room(run.model.arm, scenery=True, robot=run.robot))
+        self._run = run
+        self._fineness = fineness
+        engine = load_engine(rendered_plant(str(run.track.row["plant"])))
+        self._scene = engine.scene(Room(run.model.arm, scenery=True, robot=run.robot))
         self._camera = run.robot.pinhole.reaching(run.robot.workspace.camera_distance)
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]
@@ -155,16 +172,17 @@ class Replay(AbstractContextManager["Replay"]):
 
     def place(self, k: int) -> None:
         """Put arm and camera where they were in period `k`."""
-        self._pose = self._poses[k >= self._run.moved_from]
-        self._scene.place(self._run.model.arm.joint_angle(self._run.joint_position[k]))
+        camera_moved = k >= self._run.moved_from
+        self._pose = self._poses[1 if camera_moved else 0]
+        q = self._run.joint_position[k]
+        self._scene.place(self._run.model.arm.joint_angle(q))
 
     def camera_view(self) -> ByteArray:
         """Return the image of the run's camera with the detected ball marked, (h, w, 3)."""
         rgba, buffer = self._scene.render(self._camera, self._pose)
-        found = find_ball(rgba, buffer, self._camera, self._run.robot.workspace.ball_radius)
-        return draw_detection(
-            rgba[..., :3], found, self._camera, self._run.robot.workspace.ball_radius
-        )
+        ball_radius = self._run.robot.workspace.ball_radius
+        found = find_ball(rgba, buffer, self._camera, ball_radius)
+        return draw_detection(rgba[..., :3], found, self._camera, ball_radius)
 
     def overview(self, trails: list[Trail]) -> ByteArray:
         """Return the arm from outside with trails, pale where they are hidden: (480, 640, 3) times the fineness."""
@@ -182,27 +200,24 @@ class Replay(AbstractContextManager["Replay"]):
         pixels, far = self._overview.pixels(trail.points)
         if (far < camera.near).any():
             return
-        columns, rows = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
-        hidden = far > depth[rows, columns] + SEEN_DEPTH
-        corners = np.round(pixels * 16).astype(np.int32)
+        last_pixel = [camera.width - 1, camera.height - 1]
+        columns, rows = np.clip(pixels.astype(int), 0, last_pixel).T
+        hidden_point = far > depth[rows, columns] + VISIBLE_DEPTH
+        hidden = hidden_point[1:] | hidden_point[:-1]  # a value for each segment
+        corners = np.round(pixels * 2**SUBPIXEL_BITS).astype(np.int32)
         width = max(1, round(trail.width * self._fineness))
-        covered = hidden[1:] | hidden[:-1]
-        for wanted in (True, False):
-            layer = picture.copy() if wanted else picture
-            for i in np.flatnonzero(covered == wanted):
-                cv2.line(
-                    layer,
-                    corners[i].tolist(),
-                    corners[i + 1].tolist(),
-                    trail.colour,
-                    width,
-                    cv2.LINE_AA,
-                    4,
-                )
-            if wanted:
-                cv2.addWeighted(
-                    layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture
-                )
+
+        def draw(image: ByteArray, segments: np.ndarray) -> None:
+            for i in np.flatnonzero(segments):
+                begin = corners[i].tolist()
+                end = corners[i + 1].tolist()
+                cv2.line(image, begin, end, trail.colour, width, cv2.LINE_AA, SUBPIXEL_BITS)
+
+        # The hidden segments shine through as one layer; the visible ones are drawn over it.
+        layer = picture.copy()
+        draw(layer, hidden)
+        cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
+        draw(picture, ~hidden)
 
 
 def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:
@@ -218,7 +233,8 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
         raise ConfigurationError(
             f"run {row['run_id']} cannot be shown: films have no camera that turns"
         )
-    logged, drawn = values_drawn(row), json.loads(json.dumps(sample.as_record()))
+    logged = values_drawn(row)
+    drawn = json.loads(json.dumps(sample.as_record()))  # as the table has it: lists, no tuples
     if any(logged.get(name) != value for name, value in drawn.items()):
         raise ConfigurationError(
             f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "
@@ -232,8 +248,7 @@ def _first_seen_by(
     moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray
 ) -> int:
     """Return the first period in which the true feature (k, m) is that of the moved camera at q (k, n)."""
-    before, after = (
-        np.linalg.norm(camera.feature(q) - feature, axis=1) for camera in (model, moved)
-    )
-    seen = np.flatnonzero(after < before)
+    distance_before = np.linalg.norm(model.feature(q) - feature, axis=1)
+    distance_after = np.linalg.norm(moved.feature(q) - feature, axis=1)
+    seen = np.flatnonzero(distance_after < distance_before)
     return int(seen[0]) if len(seen) else len(q)

@@ -7,6 +7,7 @@ numbers that `space.js` and `report.js` draw. `notebooks/analysis.ipynb` shows t
 
 import base64
 import hashlib
+import math
 import re
 from itertools import groupby, islice
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
 from servobench.controllers.methods import PUBLISHED
@@ -31,7 +32,7 @@ from servobench.harness.batch import results
 from servobench.harness.pictures.figures import KINDS, page_figures
 from servobench.harness.pictures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
 from servobench.harness.pictures.tracks import (
-    COLUMNS,
+    ERROR_COLUMNS,
     Shown,
     Tracks,
     label_of,
@@ -48,8 +49,8 @@ from servobench.plant.contract.files import accessing, write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
-OWN: Final = Path(__file__).parent  # of template, style and scripts
-PICTURE_BYTES: Final = 3_000_000  # of all figures in the page
+OWN: Final = Path(__file__).parent  # folder of template, style and scripts
+PICTURE_BYTES: Final = 3_000_000  # size of all figures in the page together
 SHOWN_RUNS: Final = 1000  # rows of the table of runs
 LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
 COUNTED: Final = {
@@ -58,20 +59,28 @@ COUNTED: Final = {
     "plant": "plants",
     "mismatch": "mismatches",
 }
-USUAL: Final = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}  # not mentioned
+# The scope of a page mentions these columns only where they differ from the default.
+USUAL: Final = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}
 SWEPT: Final = {
     "noise_factor": "factors of noise",
     "latency_s": "latencies",
     "period_s": "control periods",
 }
-MOST_POINTS = 150  # of a path; more cannot be distinguished
-MOST_VIEWS = 24  # plant, mismatch and task
-CURVE_POINTS = (40, 160)  # of the error of a run: at least, at most
-CURVE_BYTES = 1.2e6  # of all errors together
-NUMBER_BYTES = 6  # of one number in the page
+MAX_PATH_POINTS = 150  # more cannot be distinguished
+MAX_VIEWS = 24  # views are counted over plants, mismatches and tasks
+MIN_CURVE_POINTS = 40  # points of the error of a run
+MAX_CURVE_POINTS = 160
+CURVE_BYTES = 1.2e6  # size of all errors together
+NUMBER_BYTES = 6  # size of one number in the page
 STEPS_AT_ONCE = 64  # runs whose steps are in memory at a time
-DIGITS = 4  # significant, of a number in the page
-DASHES = {"-": [], "--": [7, 4], "-.": [8, 3, 2, 3], ":": [2, 3]}  # px, of the named line styles
+DIGITS = 4  # significant digits of a number in the page
+# [px] Lengths of strokes and gaps of matplotlib's named line styles.
+DASHES: Final[dict[str, list[float]]] = {
+    "-": [],
+    "--": [7, 4],
+    "-.": [8, 3, 2, 3],
+    ":": [2, 3],
+}
 Json = dict[str, Any]
 ESTIMATE: Final = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<high>[^,\[\]]+)\]")
 NUMBER: Final = re.compile(r"[-+]?(\d|∞|–$)")
@@ -80,8 +89,9 @@ BREAKS: Final = re.compile(r"([_:+=/,.])")
 TICKED: Final = re.compile(r"`([^`]*)`")
 CONTROLLER: Final = (tables.WHICH, "controller")
 INFINITE: Final = "∞"
-LENGTHY: Final = 24  # letters of a word that may be broken anywhere
-FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
+LENGTHY: Final = 24  # letters from which on a word may be broken anywhere
+PHONE_COLUMNS: Final = 4  # columns of a table that fit on a phone
+TABLET_COLUMNS: Final = 8
 
 
 class Picture(NamedTuple):
@@ -89,7 +99,7 @@ class Picture(NamedTuple):
 
     kind: str  # a key of `servobench.harness.pictures.figures.KINDS`
     title: str  # alternative text
-    tasks: tuple[str, ...]  # that it shows; none if it is of all
+    tasks: tuple[str, ...]  # the tasks that it shows; empty if it shows all
     wide: Drawing  # for a sheet of paper, a notebook and most screens
     narrow: Drawing  # for a phone
 
@@ -112,11 +122,12 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
 
 def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
-    pictures, size = [], 0
-    for named, slim in page_figures(
-        folder, runs, [name for name, kind in KINDS.items() if kind.in_page]
-    ):
-        wide, narrow = drawing_of(named.figure, WIDE), drawing_of(slim.figure, NARROW)
+    pictures: list[Picture] = []
+    size = 0
+    kinds = [name for name, kind in KINDS.items() if kind.in_page]
+    for named, slim in page_figures(folder, runs, kinds):
+        wide = drawing_of(named.figure, WIDE)
+        narrow = drawing_of(slim.figure, NARROW)
         size += len(wide.data) + len(narrow.data)
         if size > PICTURE_BYTES:
             break
@@ -125,22 +136,16 @@ def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
-    views, shown = path_views(folder, runs), _shown(runs)
-    style, scripts = (
-        _asset("report.css"),
-        [_asset("report.js"), *([_asset("space.js")] if views else [])],
-    )
-    numbered, facts = tables.runs_table(shown), describe_folder(folder, runs)
+    views = path_views(folder, runs)
+    style = _asset("report.css")
+    scripts = [_asset("report.js")]
+    if views:
+        scripts.append(_asset("space.js"))
+    shown = _shown(runs)
+    numbered = tables.runs_table(shown)
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
-    environment = Environment(
-        loader=FileSystemLoader(OWN),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"breakable": breakable, "cell": cell, "marked": marked, "sheet": sheet}
-    return environment.get_template(TEMPLATE).render(
+    facts = describe_folder(folder, runs)
+    return _template().render(
         folder=folder.resolve().name,
         policy=_policy(style, scripts),
         style=Markup(style),
@@ -166,6 +171,19 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
     )
 
 
+def _template() -> Template:
+    """Return the template of the page, with its filters."""
+    environment = Environment(
+        loader=FileSystemLoader(OWN),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"breakable": breakable, "cell": cell, "marked": marked, "sheet": sheet}
+    return environment.get_template(TEMPLATE)
+
+
 def _asset(name: str) -> str:
     return (OWN / name).read_text(encoding="utf-8")
 
@@ -174,11 +192,11 @@ def _policy(style: str, scripts: list[str]) -> str:
     """Return the page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
 
     def digests(texts: list[str]) -> str:
-        found = (
-            base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
-            for text in texts
-        )
-        return " ".join(f"'sha256-{digest}'" for digest in found)
+        sources = []
+        for text in texts:
+            digest = hashlib.sha256(text.encode()).digest()
+            sources.append(f"'sha256-{base64.b64encode(digest).decode('ascii')}'")
+        return " ".join(sources)
 
     own = f"style-src {digests([style])}; script-src {digests(scripts)}"
     return f"default-src 'none'; img-src data:; {own}; base-uri 'none'; form-action 'none'"
@@ -186,23 +204,29 @@ def _policy(style: str, scripts: list[str]) -> str:
 
 def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
     """Return one line that names the controllers, tasks, plants and conditions compared."""
-    words = [f"{runs[name].nunique()} {many}" if runs[name].nunique() > 1 else str(runs[name].iloc[0])
-             for name, many in COUNTED.items()]  # fmt: skip
-    words += [f"{name} {' and '.join(Path(str(each)).name for each in runs[name].unique())}"
-              for name, usual in USUAL.items() if name in runs and (runs[name] != usual).any()]  # fmt: skip
-    words += [f"{runs[name].nunique(dropna=False)} {SWEPT.get(name, f'values of {name}')}"
-              for name in varied_columns(runs.columns) if runs[name].nunique(dropna=False) > 1]  # fmt: skip
+    words = []
+    for name, plural in COUNTED.items():
+        different = runs[name].nunique()
+        words.append(f"{different} {plural}" if different > 1 else str(runs[name].iloc[0]))
+    for name, usual in USUAL.items():
+        if name in runs and (runs[name] != usual).any():
+            named = [Path(str(each)).name for each in runs[name].unique()]
+            words.append(f"{name} {' and '.join(named)}")
+    for name in varied_columns(runs.columns):
+        values = runs[name].nunique(dropna=False)
+        if values > 1:
+            words.append(f"{values} {SWEPT.get(name, f'values of {name}')}")
     count = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
-    return f"{count}: {', '.join(words)}; {'seeds' if runs['seed'].nunique() > 1 else 'seed'} {facts['seeds']}."
+    seeds = "seeds" if runs["seed"].nunique() > 1 else "seed"
+    return f"{count}: {', '.join(words)}; {seeds} {facts['seeds']}."
 
 
 def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the runs that have a row, with their place in the table: of many, those that went wrong before others."""
     known = runs.reset_index(drop=True)
     wrong = ~comparison.outcomes(known).isin(ACHIEVED)
-    return known.loc[
-        wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]
-    ].sort_index()
+    wrong_first = wrong.sort_values(ascending=False, kind="stable").index
+    return known.loc[wrong_first[:SHOWN_RUNS]].sort_index()
 
 
 def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
@@ -211,10 +235,12 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     shown = comparison.in_handy_units(shown)
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
     scales = {name: comparison.shown_unit(name, shown)[1] for name in known}
+    # Runs of one controller under the same conditions, over all seeds, have one place.
     keys = ("controller", "task", *tables.CONDITIONS, *varied_columns(shown.columns))
     place = shown.groupby([name for name in keys if name in shown], dropna=False).ngroup()
-    runs = {
-        str(number): {
+    runs = {}
+    for number, row in zip(shown.index, shown.to_dict("records"), strict=True):
+        runs[str(number)] = {
             "id": str(row["run_id"]),
             "controller": str(row["controller"]),
             "place": int(place[number]),
@@ -222,24 +248,26 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
             "band": rounded(Shown(row).settling_band),
             "values": [rounded(scales[name] * float(row[name])) for name in known],
         }
-        for number, row in zip(shown.index, shown.to_dict("records"), strict=True)
-    }
-    numbers = {str(row): str(number) for number, row in shown["run_id"].items()}
+    numbers = {str(run_id): str(number) for number, run_id in shown["run_id"].items()}
+    styles = method_styles(shown["controller"].astype(str))
     return {
         "measures": [comparison.metric_heading(name, shown) for name in known],
         "runs": runs,
         "curves": {numbers[name]: curve for name, curve in curves.items()},
         "swatches": {
-            name: {
-                "colour": style.colour,
-                "dash": DASHES[style.line]
-                if style.line in DASHES
-                else [2.0 * length for length in style.line[1]],
-            }
-            for name, style in method_styles(shown["controller"].astype(str)).items()
+            name: {"colour": style.colour, "dash": _dashes(style.line)}
+            for name, style in styles.items()
         },
         "views": views,
     }
+
+
+def _dashes(line: Any) -> list[float]:  # noqa: ANN401 - a line style of matplotlib
+    """Return the lengths [px] of strokes and gaps of a line style in the page."""
+    if line in DASHES:
+        return DASHES[line]
+    _, lengths = line
+    return [2.0 * length for length in lengths]
 
 
 def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
@@ -254,7 +282,7 @@ def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
         for task, tracks in group.tasks.items()
         if all(len(track.features) >= 3 for track in tracks.values())
     )
-    return list(islice(views, MOST_VIEWS))
+    return list(islice(views, MAX_VIEWS))
 
 
 def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
@@ -263,22 +291,25 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     Of many runs each has few points: each is the largest error of the periods for which it stands. Of more runs than
     fit into a page, the first ones have a curve.
     """
-    least, most = CURVE_POINTS
-    wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
-    points = int(np.clip(CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted))), least, most))
+    wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * MIN_CURVE_POINTS)))
+    fitting = CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted)))
+    points = int(np.clip(fitting, MIN_CURVE_POINTS, MAX_CURVE_POINTS))
     curves = {}
     for first in range(0, len(wanted), STEPS_AT_ONCE):
-        for track in load_tracks(
-            folder, wanted[first : first + STEPS_AT_ONCE], COLUMNS[:3]
-        ):  # the error over time
+        some = wanted[first : first + STEPS_AT_ONCE]
+        for track in load_tracks(folder, some, ERROR_COLUMNS):
             bins = np.array_split(track.error(), min(points, len(track.table)))
-            error = [
-                rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None
-                for part in bins
-            ]
-            end, unit = rounded(float(track.time[-1])), track.error_unit[0]
-            curves[track.row["run_id"]] = {"end": end, "unit": unit, "error": error}
+            curves[track.row["run_id"]] = {
+                "end": rounded(float(track.time[-1])),
+                "unit": track.error_unit[0],
+                "error": [_largest(part) for part in bins],
+            }
     return curves
+
+
+def _largest(errors: FloatArray) -> float | None:
+    """Return the largest known error for JSON, None where none is finite."""
+    return rounded(float(np.nanmax(errors))) if np.isfinite(errors).any() else None
 
 
 def rounded(value: float) -> float | None:
@@ -290,32 +321,34 @@ def _view(title: str, tracks: Tracks) -> Json:
     few = {name: track.for_path() for name, track in tracks.items()}
     whole = longest(few)
     reference = whole.vectors("reference_")[:, :3]
+    if whole.point_to_point:  # a fixed target is one point
+        reference = reference[:1]
+    true = {name: track.vectors("true_feature_")[:, :3] for name, track in few.items()}
+    start = whole.vectors("true_feature_")[:1, :3]
     return {
         "title": title,
         "axes": [label_of(name).replace("z [", "depth z [") for name in whole.features[:3]],
-        "reference": _points(reference[:1] if whole.point_to_point else reference),
-        "start": _points(whole.vectors("true_feature_")[:1, :3]),
-        "paths": {
-            name: _points(track.vectors("true_feature_")[:, :3]) for name, track in few.items()
-        },
+        "reference": _points(reference),
+        "start": _points(start),
+        "paths": {name: _points(path) for name, path in true.items()},
     }
 
 
 def _points(points: FloatArray) -> list[list[float | None]]:
-    """Return points as rows of a few significant numbers."""
-    step = max(1, -(-len(points) // MOST_POINTS))
-    chosen = points[np.isfinite(points).all(axis=1)]
-    kept = np.unique(
-        [*range(0, len(chosen), step), *([len(chosen) - 1] if len(chosen) else [])]
-    ).astype(int)
-    return [[rounded(float(x)) for x in point] for point in chosen[kept]]
+    """Return up to `MAX_PATH_POINTS` points and the last one, as rows of numbers with few digits."""
+    step = max(1, math.ceil(len(points) / MAX_PATH_POINTS))
+    known = points[np.isfinite(points).all(axis=1)]
+    kept = list(range(0, len(known), step))
+    if kept and kept[-1] != len(known) - 1:
+        kept.append(len(known) - 1)
+    return [[rounded(float(x)) for x in known[i]] for i in kept]
 
 
 class Cell(NamedTuple):
     """A cell of a table."""
 
     text: str
-    interval: str = ""  # of the number; empty without one
+    interval: str = ""  # interval of the number; empty without one
     number: bool = False  # whether it is to be read as a number
 
     @property
@@ -327,10 +360,9 @@ class Cell(NamedTuple):
 class Sheet(NamedTuple):
     """The columns of a table."""
 
-    groups: list[
-        tuple[str, int]
-    ]  # title and number of columns of each group of columns; empty without groups
-    headings: list[tuple[str, str]]  # of each column: name, unit
+    # Title and number of columns of each group of columns; empty without groups.
+    groups: list[tuple[str, int]]
+    headings: list[tuple[str, str]]  # name and unit of each column
     size: str  # `few`, `some` or `many` columns, for the width at which rows become cards
     pairs: bool  # whether every group has two columns, which stay side by side in a card
     controller: int | None  # the column with the controller's name, if there is one
@@ -339,16 +371,28 @@ class Sheet(NamedTuple):
 def sheet(table: pd.DataFrame) -> Sheet:
     """Return the columns of a table, which are headings or pairs (group, heading)."""
     columns = [name if isinstance(name, tuple) else (tables.WHICH, str(name)) for name in table]
-    spans = [(group, len(list(own))) for group, own in groupby(str(group) for group, _ in columns)]
-    units = [str(heading).partition(" [") for _, heading in columns]
-    size = "few" if len(columns) <= FEW else "some" if len(columns) <= SOME else "many"
+    groups = [str(group) for group, _ in columns]
+    spans = [(group, len(list(own))) for group, own in groupby(groups)]
+    headings = []
+    for _, heading in columns:
+        name, _, unit = str(heading).partition(" [")
+        headings.append((name, unit.removesuffix("]")))
+    grouped = len(spans) > 1
+    first, *others = [count for _, count in spans] or [0]
     return Sheet(
-        spans if len(spans) > 1 else [],
-        [(name, unit.removesuffix("]")) for name, _, unit in units],
-        size,
-        len(spans) > 1 and [count for _, count in spans] == [1, *[2] * (len(spans) - 1)],
-        columns.index(CONTROLLER) if CONTROLLER in columns else None,
+        groups=spans if grouped else [],
+        headings=headings,
+        size=_size(len(columns)),
+        pairs=grouped and first == 1 and all(count == 2 for count in others),
+        controller=columns.index(CONTROLLER) if CONTROLLER in columns else None,
     )
+
+
+def _size(columns: int) -> str:
+    """Return the word for a number of columns, as the page's style knows it."""
+    if columns <= PHONE_COLUMNS:
+        return "few"
+    return "some" if columns <= TABLET_COLUMNS else "many"
 
 
 def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table
@@ -357,9 +401,8 @@ def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table
     match = ESTIMATE.fullmatch(text)
     if match is None:
         return Cell(text, number=NUMBER.match(text) is not None)
-    if {match["value"][0], match["low"], match["high"]} == {
-        INFINITE
-    }:  # an interval from ∞ to ∞ says nothing
+    parts = {match["value"][0], match["low"], match["high"]}
+    if parts == {INFINITE}:  # an interval from ∞ to ∞ says nothing
         return Cell(INFINITE, number=True)
     return Cell(match["value"], f"{match['low']} to {match['high']}", number=True)
 
@@ -379,12 +422,15 @@ def plain(value: Any) -> str:  # noqa: ANN401 - a cell of any table
 
 def breakable(text: object) -> Markup:
     """Return escaped text that may be broken after signs such as `_` and `:`."""
-    return Markup("<wbr>").join(escape(part) for part in BREAKS.sub("\\1\0", str(text)).split("\0"))
+    parts = BREAKS.sub("\\1\0", str(text)).split("\0")
+    return Markup("<wbr>").join(escape(part) for part in parts)
 
 
 def marked(text: object) -> Markup:
     """Return escaped text in which words between backticks are set as code."""
-    return Markup("").join(
-        Markup("<code>{}</code>").format(part) if i % 2 else escape(part)
-        for i, part in enumerate(TICKED.split(str(text)))
-    )
+    code = Markup("<code>{}</code>")
+    pieces = []
+    for i, part in enumerate(TICKED.split(str(text))):
+        between_ticks = i % 2 == 1
+        pieces.append(code.format(part) if between_ticks else escape(part))
+    return Markup("").join(pieces)

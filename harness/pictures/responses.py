@@ -12,6 +12,7 @@
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
@@ -53,7 +54,7 @@ from servobench.harness.pictures.tracks import (
 from servobench.plant.contract.checks import FloatArray
 
 COLUMNS: Final = 2
-LINE: Final = 0.17  # [in] of the legend
+LINE: Final = 0.17  # [in] height of a line of the legend
 DrawPanel = Callable[[Axes, Ensembles, Styles], None]
 COMMAND: Final = "joint_velocity_command_"
 ROW: Final = 0.72  # [in] a controller
@@ -64,11 +65,11 @@ QUANTITIES: Final = (
     ("jerk [rad/s³]", "joint_jerk_rms_rad_s3", "RMS {:.3g}"),
 )
 MARK_SIZE: Final = 6.5  # [points] width of the mark at a settling time
-EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
-AXIS_ROOM: Final = 1.3  # of an axis over the largest error after the approach
-NEAR: Final = 0.02  # share of a time axis within which marks stand side by side
+EXACT: Final = 1e-7  # [%] error of an estimate that counts as the truth
+AXIS_ROOM: Final = 1.3  # [1] length of an axis over the largest error after the approach
+NEAR: Final = 0.02  # [1] share of a time axis within which marks stand side by side
 FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
-OUTSIDE: Final = 1e12  # of every picture
+OUTSIDE: Final = 1e12  # a number that is outside of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
 
 
@@ -79,14 +80,12 @@ def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = 
     settled.
     """
     figure, panels = _draw_tasks(tasks, styles, draw_error, layout)
-    show_errors(
-        panels[0][0], [ensemble for ensembles in tasks.values() for ensemble in ensembles.values()]
-    )
+    everything = [ensemble for ensembles in tasks.values() for ensemble in ensembles.values()]
+    first_panel, _ = panels[0]
+    show_errors(first_panel, everything)  # all panels share its ordinate
     for axes, task in panels:
-        until, end = (
-            shown_until(tasks[task]),
-            max(float(own.time[-1]) for own in tasks[task].values()),
-        )
+        until = shown_until(tasks[task])
+        end = max(float(ensemble.time[-1]) for ensemble in tasks[task].values())
         if until < end:
             axes.set_xlim(-0.02 * until, until)
             axes.set_xlabel(f"time [s]; the move lasts {end:.2g} s")
@@ -97,14 +96,15 @@ def draw_jacobians(
     tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE
 ) -> Figure | None:
     """Draw how far the estimated Jacobian is from the true one, over seeds; None if no run knows it."""
-    known = {
-        task: {
-            name: own for name, own in ensembles.items() if np.isfinite(own.jacobian_error).any()
-        }
-        for task, ensembles in tasks.items()
-    }
-    known = {task: ensembles for task, ensembles in known.items() if ensembles}
-    return _draw_tasks(known, styles, draw_jacobian, layout)[0] if known else None
+    known: dict[str, Ensembles] = {}
+    for task, ensembles in tasks.items():
+        for name, ensemble in ensembles.items():
+            if np.isfinite(ensemble.jacobian_error).any():
+                known.setdefault(task, {})[name] = ensemble
+    if not known:
+        return None
+    figure, _ = _draw_tasks(known, styles, draw_jacobian, layout)
+    return figure
 
 
 def draw_features(
@@ -141,20 +141,28 @@ def draw_tracking(
     Of a long run, the latter is drawn at its end only, on a narrow sheet not at all.
     """
     if layout.columns < COLUMNS:
-        return _draw_tasks({"": ensembles}, styles, draw_error, layout)[0]
-    features, long = _features({"": tracks}), any(track.long for track in tracks.values())
-    heads, closing = divisions(ensembles), {name: track.closing() for name, track in tracks.items()}
+        figure, _ = _draw_tasks({"": ensembles}, styles, draw_error, layout)
+        return figure
+    features = _features({"": tracks})
+    long = any(track.long for track in tracks.values())
+    heads = divisions(ensembles)
+    closing = {name: track.closing() for name, track in tracks.items()}
     figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
     panels = figure.subplots(
-        1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
+        1 + len(features),
+        len(heads),
+        sharex=False if long else "col",
+        sharey="row",
+        squeeze=False,
         height_ratios=[2.2, *[1.0] * len(features)],
-    )  # fmt: skip
+    )
     for column, (head, names) in zip(panels.T, heads.items(), strict=True):
         draw_error(column[0], {name: ensembles[name] for name in names}, styles)
         column[0].set_title(head)
         shown = {name: closing[name] for name in names if name in closing}
-        for axes, feature in zip(column[1:], features, strict=True) if shown else ():
-            _draw_feature_error(axes, shown, styles, feature)
+        if shown:
+            for axes, feature in zip(column[1:], features, strict=True):
+                _draw_feature_error(axes, shown, styles, feature)
         column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
         if long:
             column[0].set_xlabel("time [s]")
@@ -166,23 +174,23 @@ def _draw_tasks(
     tasks: Mapping[str, Ensembles], styles: Styles, draw: DrawPanel, layout: Layout
 ) -> tuple[Figure, list[tuple[Axes, str]]]:
     """Draw a panel for each task and division of methods; return the figure, and the panels with their tasks."""
-    cells = [
-        (task, head, {name: ensembles[name] for name in names})
-        for task, ensembles in tasks.items()
-        for head, names in divisions(ensembles).items()
-    ]
-    names = {name for ensembles in tasks.values() for name in ensembles}
+    cells = []
+    for task, ensembles in tasks.items():
+        for heading, names in divisions(ensembles).items():
+            cells.append((task, heading, {name: ensembles[name] for name in names}))
+    methods = {name for ensembles in tasks.values() for name in ensembles}
     row = 2.8 if layout.wide and len(cells) == 1 else 2.0
-    head = 0.6 + LINE * (2 + len(names) * (0.25 if layout.wide else 1.0))
-    figure, panels = panel_grid(
-        len(cells), row, replace(layout, columns=min(COLUMNS, layout.columns)), head
-    )
+    head = 0.6 + LINE * (2 + len(methods) * (0.25 if layout.wide else 1.0))
+    sheet = replace(layout, columns=min(COLUMNS, layout.columns))
+    figure, panels = panel_grid(len(cells), row, sheet, head)
+    drawn = []
     for axes, (task, heading, ensembles) in zip(panels, cells, strict=True):
         draw(axes, ensembles, styles)
         axes.set(title=", ".join(filter(None, (task, heading))), xlabel="time [s]")
+        drawn.append((axes, task))
     label_rows(panels)
     add_legend(figure, panels)
-    return figure, [(axes, task) for axes, (task, _, _) in zip(panels, cells, strict=True)]
+    return figure, drawn
 
 
 def _features(tasks: Mapping[str, Tracks]) -> list[str]:
@@ -202,8 +210,11 @@ def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) ->
         axes.axvline(
             first.camera_moved_at, color="0.4", linewidth=0.9, linestyle="-.", label=CAMERA_MOVES
         )
-    averaged = "" if first.point_to_point else f",\nRMS over {WINDOW:g} s"
-    axes.set_ylabel(f"true error [{first.error_unit[0]}]{averaged}")
+    unit, _ = first.error_unit
+    label = f"true error [{unit}]"
+    if not first.point_to_point:
+        label += f",\nRMS over {WINDOW:g} s"
+    axes.set_ylabel(label)
 
 
 def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
@@ -211,10 +222,10 @@ def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
 
     Errors of a small part of the settling band are left out: they are noise, which a median describes better.
     """
-    largest = max(
-        float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0))
-        for ensemble in ensembles
-    )
+    largest = 0.0
+    for ensemble in ensembles:
+        known = ensemble.error[np.isfinite(ensemble.error)]
+        largest = max(largest, float(known.max(initial=0.0)))
     if largest > 0.0:
         low = FLOOR * next(iter(ensembles)).settling_band
         plain_logarithms(axes)
@@ -233,13 +244,18 @@ def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles)
     for name in exact:
         axes.plot([], [], label=f"{name} (exact)", **styles[name].line_arguments(1))
     axes.set_ylabel("Jacobian error [%]")
-    if any(
-        (np.asarray(line.get_ydata(), dtype=np.float64) > 0.0).any() for line in axes.get_lines()
-    ):
+    drawn = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.get_lines()]
+    if any((values > 0.0).any() for values in drawn):
         plain_logarithms(axes)
     else:
         axes.text(
-            0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color="0.4"
+            0.5,
+            0.5,
+            "no values",
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+            color="0.4",
         )
 
 
@@ -251,14 +267,21 @@ def draw_over_seeds(
 ) -> None:
     """Draw the median over seeds of a curve of each ensemble, (r, k), and between which values most seeds are."""
     for name, ensemble in ensembles.items():
-        values, style = curve(ensemble), styles[name]
+        values = curve(ensemble)
+        style = styles[name]
         low, middle, high = (quantile(values, share) for share in BAND)
         known = np.isfinite(middle)
         if not known.any():
             continue
         if len(values) > 1:
-            axes.fill_between(ensemble.time, np.minimum(low, OUTSIDE), np.minimum(high, OUTSIDE), color=style.colour,
-                              alpha=min(0.18, 0.5 / len(ensembles)), linewidth=0.0)  # fmt: skip
+            axes.fill_between(
+                ensemble.time,
+                np.minimum(low, OUTSIDE),
+                np.minimum(high, OUTSIDE),
+                color=style.colour,
+                alpha=min(0.18, 0.5 / len(ensembles)),
+                linewidth=0.0,
+            )
         shown = np.where(known, middle, np.nan)
         axes.plot(ensemble.time, shown, label=name, **style.line_arguments(len(shown)))
         if ensemble.mostly_ended:
@@ -272,15 +295,17 @@ def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str
     axes.axhline(0.0, color="0.4", linewidth=0.9)
     reach = 0.0
     for label, track in tracks.items():
-        error = factor * (
-            track.column(f"true_feature_{feature}") - track.column(f"reference_{feature}")
-        )
+        true = track.column(f"true_feature_{feature}")
+        desired = track.column(f"reference_{feature}")
+        error = factor * (true - desired)
         _draw_values(axes, track, error, label, styles)
         late = np.abs(error[len(error) // 2 :])
         reach = max(reach, float(np.max(late[np.isfinite(late)], initial=0.0)))
     if reach > 0.0:
-        low, high = axes.get_ylim() if axes.get_autoscaley_on() is False else (0.0, 0.0)
-        reach = max(AXIS_ROOM * reach, -low, high)
+        reach *= AXIS_ROOM
+        if not axes.get_autoscaley_on():  # another panel of the row has set the common range
+            low, high = axes.get_ylim()
+            reach = max(reach, -low, high)
         axes.set_ylim(-reach, reach)
     axes.set_ylabel(f"error in\n{name} [{unit}]")
 
@@ -308,16 +333,15 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
     anchor = -math.inf
     beside = 0  # marks that stand from the anchor on
     settled = [
-        each
-        for each in ensembles.items()
-        if math.isfinite(each[1].settling_time + each[1].settling_band)
+        (ensemble.settling_time, name)
+        for name, ensemble in ensembles.items()
+        if math.isfinite(ensemble.settling_time + ensemble.settling_band)
     ]
-    for name, ensemble in sorted(settled, key=lambda each: each[1].settling_time):
-        if ensemble.settling_time >= anchor + beside * near:
-            anchor = ensemble.settling_time
+    for settling_time, name in sorted(settled, key=itemgetter(0)):
+        if settling_time >= anchor + beside * near:
+            anchor = settling_time
             beside = 0
         style = styles[name]
-        edge = style.colour if style.hollow else "black"
         place = offset_copy(
             axes.transData,
             axes.get_figure(root=True),
@@ -325,9 +349,20 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
             -0.6 * MARK_SIZE,
             units="points",
         )
-        axes.plot(anchor, ensemble.settling_band, marker="^", markersize=MARK_SIZE, linestyle="", transform=place,
-                  color=style.colour, markeredgecolor=edge, markeredgewidth=1.4 if style.hollow else 0.6,
-                  markerfacecolor=style.face, zorder=11, gid=SETTLED)  # fmt: skip
+        axes.plot(
+            anchor,
+            ensembles[name].settling_band,
+            marker="^",
+            markersize=MARK_SIZE,
+            linestyle="",
+            transform=place,
+            color=style.colour,
+            markeredgecolor=style.colour if style.hollow else "black",
+            markeredgewidth=1.4 if style.hollow else 0.6,
+            markerfacecolor=style.face,
+            zorder=11,
+            gid=SETTLED,
+        )
         beside += 1
 
 
@@ -337,10 +372,11 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
     A long run is shown at its end. A wide layout has room for a metric in each panel.
     """
     shown = {name: track.closing() for name, track in tracks.items()}
-    columns = max(
-        ([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()),
-        key=len,
-    )
+    commands = [
+        [name for name in track.table.columns if name.startswith(COMMAND)]
+        for track in shown.values()
+    ]
+    columns = max(commands, key=len)
     if not columns:
         return None
     figure = Figure(figsize=(layout.width, 1.2 + max(ROW * len(shown), 1.6)), layout="constrained")
@@ -349,12 +385,18 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
         for number, column in enumerate(columns):
             _draw_joint(line, track, column, number)
         for axes, (_, metric, form) in zip(line, QUANTITIES, strict=True):
-            known = track.row.get(metric)
-            words = (
-                "" if known is None or np.isnan(known) or not layout.wide else form.format(known)
+            value = track.row.get(metric)
+            known = value is not None and not np.isnan(value)
+            axes.text(
+                0.985,
+                0.93,
+                form.format(value) if known and layout.wide else "",
+                transform=axes.transAxes,
+                ha="right",
+                va="top",
+                fontsize=TEXT - 1.5,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0},
             )
-            axes.text(0.985, 0.93, words, transform=axes.transAxes, ha="right", va="top", fontsize=TEXT - 1.5,
-                      bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0})  # fmt: skip
         line[0].set_ylabel(
             name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5
         )
@@ -374,10 +416,17 @@ def _draw_joint(line: np.ndarray, track: Track, column: str, number: int) -> Non
     colour, dashes = JOINTS[number % len(JOINTS)]
     values: FloatArray = track.column(column)
     period = float(track.time[1] - track.time[0]) if len(values) > 1 else 1.0
+    joint = column.removeprefix(COMMAND).rpartition("_rad_s")[0]
     for order, axes in enumerate(line):
         if len(values) > order:
+            derivative = np.diff(values, n=order) / period**order
             axes.plot(
-                track.time[order:], np.diff(values, n=order) / period**order, color=colour, linestyle=dashes,
-                linewidth=0.9, label=column.removeprefix(COMMAND).rpartition("_rad_s")[0],
-                drawstyle="default" if order else "steps-post",
-            )  # fmt: skip
+                track.time[order:],
+                derivative,
+                color=colour,
+                linestyle=dashes,
+                linewidth=0.9,
+                label=joint,
+                # A command is held over its period.
+                drawstyle="steps-post" if order == 0 else "default",
+            )

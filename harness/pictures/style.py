@@ -33,10 +33,10 @@ from servobench.plant.contract.units import split_quantity
 BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
 WINE = "#882255"  # of Tol's palette, which goes with it
-MARKS = 8  # on each line
-WIDTH = 7.2  # [in] of a figure: both columns of a paper
-MOST_LINES = 7  # of methods in a panel, not counting those that know the true robot
-TEXT = 8.0  # [pt] of a figure of that width
+MARKS = 8  # markers on each line
+WIDTH = 7.2  # [in] width of a figure: both columns of a paper
+MAX_LINES = 7  # methods in a panel, not counting those that know the true robot
+TEXT = 8.0  # [pt] size of text in a figure of that width
 FILM_TEXT = 9.0  # [pt]
 FORMATS = ("png", "pdf")
 ALL_FORMATS: Final = (*FORMATS, "svg", "pgf")
@@ -44,29 +44,39 @@ ALL_FORMATS: Final = (*FORMATS, "svg", "pgf")
 INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4, "pt": 72.27}
 TWO_COLUMNS: Final = 5.0  # [in] from which on panels stand beside each other
 PGF_TEXT: Final = re.compile(r"(?<=\\def%\{\\%\}).*(?=\}\}%$)", re.MULTILINE)
-UNDERSCORE: Final = re.compile(r"(\$[^$]*\$)|(?<!\\)_")  # outside of formulas
+UNDERSCORE: Final = re.compile(r"(\$[^$]*\$)|(?<!\\)_")  # a formula, or an underscore outside
 TEX: Final = ("pdflatex", "lualatex", "xelatex")  # programs with which pgf measures its text
 UNDATED: Final[dict[str, Any]] = {
     "pdf": {"metadata": {"CreationDate": None}},
     "svg": {"metadata": {"Date": None}},
     "png": {"metadata": {"Software": None}},
 }
-RESOLUTION = 150  # dpi of PNG
-PALETTE = 64  # colours
+RESOLUTION = 150  # [dpi] resolution of PNG
+PALETTE = 64  # colours of a picture in a page
 STRIP = 0.04  # [in] above and below the drawing
-ENDED, END = "run ended early", "|"  # and its marker, which no method has
-SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
-# In a legend
+ENDED = "run ended early"
+END = "|"  # the marker of an early end, which no method has
+SETTLED = "settled from here on"
+CAMERA_MOVES = "camera moves"
+# Entries of a legend that begin so are no methods and stand behind these.
 NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)
-FEW_DECADES: Final = 50.0  # upper over lower end of a logarithmic axis
-LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of its sample line
+# [1] Upper over lower end of a logarithmic axis below which 2 and 5 have numbers as well.
+FEW_DECADES: Final = 50.0
+LETTER = 0.066  # [in] width of a letter of the legend
+SAMPLE = 0.55  # [in] width of the sample line of a legend
 MARGIN: Final = 0.2  # [in] on both sides of the legend
 DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
+# Colours and lines of joints in their order.
 JOINTS: Final = (
-    (BLUE, "-"), (VERMILION, (0, (4, 1))), (GREEN, "-."), (ORANGE, (0, (6, 1, 1, 1))), (PURPLE, (0, (2, 1))),
-    (SKY, "-"), (BLACK, ":"),
-)  # fmt: skip  # colours and lines of joints in their order
-DASHED = (0, (3.5, 1.5))  # of every method as published
+    (BLUE, "-"),
+    (VERMILION, (0, (4, 1))),
+    (GREEN, "-."),
+    (ORANGE, (0, (6, 1, 1, 1))),
+    (PURPLE, (0, (2, 1))),
+    (SKY, "-"),
+    (BLACK, ":"),
+)
+DASHED = (0, (3.5, 1.5))  # line of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 # Colours, lines and markers of unknown methods
 _OTHERS: Final[tuple[tuple[Any, ...], ...]] = (
@@ -98,7 +108,8 @@ class Layout:
             raise ConfigurationError(
                 f"--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got {text}"
             )
-        return cls(width, WIDE.columns if width >= TWO_COLUMNS else 1, WIDE.pixels, WIDE.density)
+        columns = WIDE.columns if width >= TWO_COLUMNS else 1
+        return cls(width, columns, WIDE.pixels, WIDE.density)
 
     @property
     def wide(self) -> bool:
@@ -112,7 +123,7 @@ class Layout:
 
 
 WIDE = Layout(WIDTH, 3, 1000, 1.5)
-NARROW = Layout(2.75, 1, 335, 2.0)  # of a phone of 390 px, with a bar to scroll
+NARROW = Layout(2.75, 1, 335, 2.0)  # for a phone of 390 px, with a bar to scroll
 
 
 @dataclass(frozen=True)
@@ -133,18 +144,29 @@ class MethodStyle:
     def line_arguments(self, points: int) -> dict[str, Any]:
         """Return keyword arguments for a matplotlib line of `points` points, with about eight markers on it."""
         step = max(1, points // MARKS)
+        first = int(self.shift * step)
         return {
-            "color": self.colour, "linestyle": self.line, "linewidth": 1.2, "marker": self.marker, "markersize": 4.0,
-            "markerfacecolor": self.face, "markevery": (int(self.shift * step), step),
-        }  # fmt: skip
+            "color": self.colour,
+            "linestyle": self.line,
+            "linewidth": 1.2,
+            "marker": self.marker,
+            "markersize": 4.0,
+            "markerfacecolor": self.face,
+            "markevery": (first, step),
+        }
 
     def path_arguments(self, points: FloatArray) -> dict[str, Any]:
         """Return keyword arguments for a line through `points`, (k, d), with about eight markers evenly along it."""
-        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        way = way_along(points)
         places = (np.arange(MARKS) + self.shift) / MARKS * way[-1]
-        return self.line_arguments(1) | {
-            "markevery": np.unique(np.searchsorted(way, places)).tolist()
-        }
+        marked = np.unique(np.searchsorted(way, places))
+        return self.line_arguments(1) | {"markevery": marked.tolist()}
+
+
+def way_along(points: FloatArray) -> FloatArray:
+    """Return the length of the path through points (k, d) from its start to each of them, (k,)."""
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(lengths)])
 
 
 Styles = dict[str, MethodStyle]
@@ -173,18 +195,19 @@ def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
     """
     wanted = list(dict.fromkeys(names))
     unknown = sorted(name for name in wanted if name not in _STYLES)
-    styles = {name: _STYLES.get(name) or _other(unknown.index(name)) for name in wanted}
-    return {
-        name: replace(style, shift=i / len(styles))
-        for i, (name, style) in enumerate(styles.items())
-    }
+    styles = {}
+    for i, name in enumerate(wanted):
+        style = _STYLES.get(name) or _other(unknown.index(name))
+        # Marks of different methods at the same place would hide each other.
+        styles[name] = replace(style, shift=i / len(wanted))
+    return styles
 
 
 def divisions(names: Iterable[str]) -> dict[str, list[str]]:
     """Return the names as published and the others, under a heading each; the upper bounds are in all.
 
     Without a method as published, or with no other, there is one division without a heading. A division of more than
-    `MOST_LINES` methods is divided further.
+    `MAX_LINES` methods is divided further.
     """
     wanted = list(dict.fromkeys(names))
     published = [name for name in wanted if name.endswith(PUBLISHED)]
@@ -198,11 +221,17 @@ def divisions(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def fitted(name: str, letters: int) -> str:
-    """Return a name in lines of at most so many letters, broken after `:` or `/` where that is possible."""
+    """Return a name in lines of up to `letters` letters, broken after `:` or `/` where that is possible."""
     lines = [""]
     for part in re.split(r"(?<=[:/])", name):
-        lines[-1:] = [lines[-1] + part] if len(lines[-1] + part) <= letters else [lines[-1], part]
-    return "\n".join(line[i : i + letters] for line in lines for i in range(0, len(line), letters))
+        if len(lines[-1] + part) <= letters:
+            lines[-1] += part
+        else:
+            lines.append(part)
+    pieces = []
+    for line in lines:  # a part that is too long is broken anywhere
+        pieces += [line[first : first + letters] for first in range(0, len(line), letters)]
+    return "\n".join(pieces)
 
 
 @contextmanager
@@ -211,28 +240,25 @@ def figure_style(size: float = FILM_TEXT) -> Iterator[None]:
 
     A `matplotlibrc` or a style of the user's does not count: pictures are the same on every machine.
     """
-    defaults: dict[Any, Any] = {
+    changed_by_user: dict[Any, Any] = {
         name: value
         for name, value in mpl.rcParamsDefault.items()
         if name != "backend" and mpl.rcParams[name] != value
     }
-    style = mpl.rc_context(
-        {
-            **defaults,
-            "font.size": size,
-            "axes.titlesize": size,
-            "axes.grid": True,
-            "grid.alpha": 0.3,
-            "axes.axisbelow": True,
-            "svg.fonttype": "none",
-            "svg.hashsalt": "servobench",
-            "pdf.fonttype": 42,
-            "pgf.texsystem": next(filter(shutil.which, TEX), TEX[0]),
-            "pgf.rcfonts": False,
-        }
-    )
-    with style, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph ")  # of a name, which the font lacks
+    own: dict[Any, Any] = {
+        "font.size": size,
+        "axes.titlesize": size,
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "axes.axisbelow": True,
+        "svg.fonttype": "none",
+        "svg.hashsalt": "servobench",
+        "pdf.fonttype": 42,
+        "pgf.texsystem": next(filter(shutil.which, TEX), TEX[0]),
+        "pgf.rcfonts": False,
+    }
+    with mpl.rc_context({**changed_by_user, **own}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph ")  # the font lacks a letter of a name
         yield
 
 
@@ -244,9 +270,10 @@ def panel_grid(
     A row is `height` high [in], title and legend together `head` [in].
     """
     columns = min(layout.columns, count)
-    rows = -(-count // columns)
+    rows = math.ceil(count / columns)
     figure = Figure(figsize=(layout.width, head + height * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    panels = grid.ravel().tolist()
     for axes in panels[count:]:
         axes.set_visible(False)
     return figure, panels[:count]
@@ -257,7 +284,10 @@ def label_rows(panels: Iterable[Axes], text: str | None = None) -> None:
     for axes in panels:
         place = axes.get_subplotspec()
         first = place is None or place.is_first_col()
-        axes.set_ylabel((axes.get_ylabel() if text is None else text) if first else "")
+        if not first:
+            axes.set_ylabel("")
+        elif text is not None:
+            axes.set_ylabel(text)
 
 
 def finish_columns(figure: Figure, panels: np.ndarray) -> None:
@@ -270,8 +300,17 @@ def finish_columns(figure: Figure, panels: np.ndarray) -> None:
 def mark_end(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle) -> None:
     """Mark the last known point (x, y) of a run that ended early."""
     last = np.flatnonzero(np.isfinite(y))[-1]
-    axes.plot(x[last], y[last], color=style.colour, marker=END, markersize=12, markeredgewidth=2.0, linestyle="",
-              zorder=12, gid=ENDED)  # fmt: skip
+    axes.plot(
+        x[last],
+        y[last],
+        color=style.colour,
+        marker=END,
+        markersize=12,
+        markeredgewidth=2.0,
+        linestyle="",
+        zorder=12,
+        gid=ENDED,
+    )
 
 
 def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
@@ -281,21 +320,35 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
+    groups = {line.get_gid() for axes in panels for line in axes.get_lines()}
     for gid, marker in ((SETTLED, "^"), (ENDED, END)):
-        if any(line.get_gid() == gid for axes in panels for line in axes.get_lines()):
+        if gid in groups:
             entries[gid] = mpl.lines.Line2D(
-                [], [], color="0.3", marker=marker, markersize=7, linestyle=""
+                [],
+                [],
+                color="0.3",
+                marker=marker,
+                markersize=7,
+                linestyle="",
             )
     entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))
-    if entries:
-        letters = math.floor((figure.get_figwidth() - SAMPLE - MARGIN) / LETTER)
-        labels = [fitted(label, letters) for label in entries]
-        longest_line = max(len(line) for label in labels for line in label.splitlines())
-        fitting = math.floor(figure.get_figwidth() / (SAMPLE + LETTER * longest_line))
-        figure.legend(
-            list(entries.values()), labels, loc="outside lower center", frameon=False, fontsize=TEXT - 0.5,
-            ncols=max(1, min(fitting, len(entries))), handlelength=2.6, columnspacing=1.2,
-        )  # fmt: skip
+    if not entries:
+        return
+    width = figure.get_figwidth()
+    letters = math.floor((width - SAMPLE - MARGIN) / LETTER)
+    labels = [fitted(label, letters) for label in entries]
+    longest_line = max(len(line) for label in labels for line in label.splitlines())
+    fitting = math.floor(width / (SAMPLE + LETTER * longest_line))
+    figure.legend(
+        list(entries.values()),
+        labels,
+        loc="outside lower center",
+        frameon=False,
+        fontsize=TEXT - 0.5,
+        ncols=max(1, min(fitting, len(entries))),
+        handlelength=2.6,
+        columnspacing=1.2,
+    )
 
 
 def plain_logarithms(axes: Axes, which: Literal["x", "y"] = "y") -> None:
@@ -304,7 +357,9 @@ def plain_logarithms(axes: Axes, which: Literal["x", "y"] = "y") -> None:
 
     def between(value: float, _position: int | None) -> str:
         low, high = sorted(axis.get_view_interval())
-        return f"{value:g}" if high < FEW_DECADES * low and f"{value:e}"[0] in "25" else ""
+        first_digit = f"{value:e}"[0]
+        numbered = high < FEW_DECADES * low and first_digit in "25"
+        return f"{value:g}" if numbered else ""
 
     axes.set(**{f"{which}scale": "log"})
     axis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
@@ -332,16 +387,17 @@ def save_figure(
     Its width is that of the figure; with `exact_width` its height is that of the drawing, without empty strips.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    paths, box = [], None
+    paths = []
+    box = None
     with figure_style(TEXT):
         if exact_width:
             drawn = box_of(figure)
             box = Bbox.from_extents(0.0, drawn.y0, figure.get_figwidth(), drawn.y1)
         for ending in formats:
-            paths.append(stem.with_name(f"{stem.name}.{ending}"))
-            write_atomically(
-                paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box))
-            )
+            path = stem.with_name(f"{stem.name}.{ending}")
+            paths.append(path)
+            content = _encode(figure, ending, box)
+            write_atomically(path, partial(Path.write_bytes, data=content))
             figure.set_layout_engine(None)  # freeze the layout: computing it dominates the save
     return paths
 
@@ -359,9 +415,12 @@ def _encode(figure: Figure, ending: str, box: Bbox | None) -> bytes:
     made = content.getvalue()
     if isinstance(made, bytes):
         return made
-    return PGF_TEXT.sub(
-        lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), made
-    ).encode()
+    return PGF_TEXT.sub(_escape_underscores, made).encode()
+
+
+def _escape_underscores(text: re.Match[str]) -> str:
+    """Return matched text for TeX with its underscores escaped; formulas stay."""
+    return UNDERSCORE.sub(lambda found: found[1] or r"\_", text[0])
 
 
 def box_of(figure: Figure) -> Bbox:
@@ -371,8 +430,9 @@ def box_of(figure: Figure) -> Bbox:
         # "none" leaves a placeholder, for which a figure is drawn once more
         figure.set_layout_engine(None)
     drawn = figure.get_tightbbox()
-    low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
-    return Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
+    left = min(0.0, drawn.x0)
+    right = max(figure.get_figwidth(), drawn.x1)
+    return Bbox.from_extents(left, drawn.y0 - STRIP, right, drawn.y1 + STRIP)
 
 
 class Drawing(NamedTuple):
@@ -388,13 +448,13 @@ def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
 
     The picture is as high as the drawing: nothing is cut, and there is no empty strip.
     """
-    large, small = io.BytesIO(), io.BytesIO()
+    large = io.BytesIO()
+    small = io.BytesIO()
     with figure_style(TEXT):
         box = box_of(figure)
+        dpi = layout.density * layout.scale
         unpacked = {"compress_level": 0}  # it is read again at once
-        figure.savefig(
-            large, dpi=layout.density * layout.scale, bbox_inches=box, pil_kwargs=unpacked
-        )
+        figure.savefig(large, dpi=dpi, bbox_inches=box, pil_kwargs=unpacked)
     # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
     with Image.open(large) as picture:
         indexed = picture.convert("RGB").quantize(
@@ -408,14 +468,15 @@ def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
 def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[str]]:
     """Return the names of a division in as few parts of about the same size as are needed, each with the bounds."""
     own = [name for name in names if name not in bounds]
-    count = -(-len(own) // MOST_LINES)
+    count = math.ceil(len(own) / MAX_LINES)
     if count <= 1:
         return {heading: names}
-    size = -(-len(own) // count)
-    return {
-        f"{heading} {i + 1} of {count}".lstrip(): own[i * size : (i + 1) * size] + bounds
-        for i in range(count)
-    }
+    size = math.ceil(len(own) / count)
+    parts = {}
+    for i in range(count):
+        title = f"{heading} {i + 1} of {count}".lstrip()
+        parts[title] = own[i * size : (i + 1) * size] + bounds
+    return parts
 
 
 def _other(index: int) -> MethodStyle:

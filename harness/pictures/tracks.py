@@ -27,26 +27,28 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 FEATURE = "feature_"
-LONG = 6000  # [rows] of a run that is not drawn row by row
-OVERVIEW = 600  # [rows] about, that stand for a long run
-CLOSING = (
-    400  # [rows] at the end of a long run that are drawn one by one: two laps at the default period
-)
-ERROR, JACOBIAN, STEP_TIME = "error_norm", "jacobian_error", "controller_time_us"
-# of which a row of an overview has that of all rows for which it stands
+LONG = 6000  # [rows] A longer run is not drawn row by row.
+OVERVIEW = 600  # [rows] About this many stand for a long run.
+# [rows] The end of a long run is drawn row by row: two laps at the default period.
+CLOSING = 400
+ERROR = "error_norm"
+JACOBIAN = "jacobian_error"
+STEP_TIME = "controller_time_us"
+# A row of an overview has the root mean square of these columns over all rows for which it stands.
 ROOT_MEAN_SQUARES = (ERROR, JACOBIAN)
-COLUMNS = ("run_id", "time_s", ERROR, JACOBIAN, STEP_TIME)
+ERROR_COLUMNS = ("run_id", "time_s", ERROR)
+COLUMNS = (*ERROR_COLUMNS, JACOBIAN, STEP_TIME)
 BAND = (0.1, 0.5, 0.9)  # quantiles over seeds: the band's edges and its middle
-WINDOW = 0.5  # [s] over which the error along a curve is averaged
-MARGIN = 1.5  # on the time until which a figure shows moves that have settled
-MIN_SHARE = 0.2  # of a run that a figure shows at least
+WINDOW = 0.5  # [s] The error along a curve is averaged over this time.
+MARGIN = 1.5  # [1] A figure shows moves for this multiple of the slowest settling time.
+MIN_SHARE = 0.2  # [1] A figure shows at least this share of a run.
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
     """Unit, band and kind in which runs of a task are shown, by their rows in the table of runs."""
 
-    row: Mapping[Any, Any]  # of the run, or of the first one
+    row: Mapping[Any, Any]  # row of the run, or of the first one
 
     @property
     def point_to_point(self) -> bool:
@@ -69,7 +71,7 @@ class Shown:
 class Track(Shown):
     """The steps of one run."""
 
-    table: pd.DataFrame  # of its steps, at least one; columns without any value are left out
+    table: pd.DataFrame  # its steps, at least one; columns without any value are left out
 
     @property
     def completed(self) -> bool:
@@ -96,26 +98,27 @@ class Track(Shown):
 
     def overview(self) -> Self:
         """Return the track with few rows; errors are root mean squares over all rows for which one stands."""
-        return self.thinned(len(self.table) // OVERVIEW) if self.long else self
+        if not self.long:
+            return self
+        return self.thinned(len(self.table) // OVERVIEW)
 
     def thinned(self, step: int) -> Self:
         """Return the track with every `step`-th row, which has the root mean square of errors over these rows."""
         if step == 1:
             return self
         few = self.table.iloc[::step].reset_index(drop=True)
+        row_of_overview = np.arange(len(self.table)) // step
         for name in ROOT_MEAN_SQUARES:
             if name in few:
-                means = (self.table[name] ** 2).groupby(np.arange(len(self.table)) // step).mean()
+                means = (self.table[name] ** 2).groupby(row_of_overview).mean()
                 few[name] = np.sqrt(means.to_numpy())
         return replace(self, table=few)
 
     def closing(self) -> Self:
         """Return the end of a long track, row by row."""
-        return (
-            replace(self, table=self.table.iloc[-CLOSING:].reset_index(drop=True))
-            if self.long
-            else self
-        )
+        if not self.long:
+            return self
+        return replace(self, table=self.table.iloc[-CLOSING:].reset_index(drop=True))
 
     def for_path(self) -> Self:
         """Return the rows that show the path in space: of a curve that is followed for long, the end."""
@@ -127,15 +130,13 @@ class Track(Shown):
 
     def column(self, name: str) -> FloatArray:
         """Return a column as (k,) numbers; NaN where the run has none."""
-        return np.asarray(
-            self.table.get(name, pd.Series(np.nan, self.table.index)), dtype=np.float64
-        )
+        unknown = pd.Series(np.nan, self.table.index)
+        return np.asarray(self.table.get(name, unknown), dtype=np.float64)
 
     def vectors(self, kind: str) -> FloatArray:
         """Return the features of a kind (`feature_`, `true_feature_`, `reference_`), (k, m) in their unit."""
-        return np.stack([self.column(kind + name) for name in self.features], axis=-1).reshape(
-            len(self.table), -1
-        )
+        columns = [self.column(kind + name) for name in self.features]
+        return np.stack(columns, axis=-1).reshape(len(self.table), -1)
 
 
 Tracks = dict[str, Track]
@@ -147,8 +148,8 @@ class Group:
 
     plant: str
     mismatch: str  # as it was given, or words for that of a twin
-    runs: pd.DataFrame  # all of this plant and mismatch
-    seed: int  # of the runs in `tasks`
+    runs: pd.DataFrame  # all runs of this plant and mismatch
+    seed: int  # seed of the runs in `tasks`
     tasks: dict[str, Tracks]  # task -> controller -> track; tasks without any step are left out
 
 
@@ -159,12 +160,15 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
         ConfigurationError: not a results folder.
     """
     for (plant, mismatch), group in with_places(runs).groupby(["plant", "mismatch"], sort=False):
-        chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
+        of_first_seed = group[group["seed"] == group["seed"].min()]
+        chosen = of_first_seed.drop_duplicates(["task", "controller"])
         tasks: dict[str, Tracks] = {}
         for track in load_tracks(folder, chosen):
-            tasks.setdefault(track.row["task"], {})[track.row["controller"]] = track
+            tracks = tasks.setdefault(track.row["task"], {})
+            tracks[track.row["controller"]] = track
         if tasks:  # a sweep keeps no steps, and a run may end before its first
-            yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
+            seed = int(chosen["seed"].iloc[0])
+            yield Group(str(plant), str(mismatch), group, seed, tasks)
 
 
 def track_of(row: Mapping[Any, Any], steps: pd.DataFrame) -> Track:
@@ -178,11 +182,10 @@ def load_tracks(
     """Yield the tracks of those runs that have steps, in their order; with all columns, or those named."""
     try:
         steps = results.load_steps(folder, runs["run_id"].tolist(), columns)
-    except (
-        ConfigurationError
-    ) as error:  # none is kept, or each of these runs ended before its first period
+    except ConfigurationError as error:
         if type(error) is not ConfigurationError:  # a file is damaged
             raise
+        # No steps are kept, or each of these runs ended before its first period.
         return
     tables = {str(run_id): own for run_id, own in steps.groupby("run_id", sort=False)}
     for row in runs.drop_duplicates("run_id").to_dict("records"):
@@ -219,11 +222,10 @@ class Ensemble(Shown):
     """The runs of one controller on one task, a row a seed."""
 
     time: FloatArray  # instants, (k,) [s]
-    error: (
-        FloatArray  # norm of the true error, (r, k) [`error_unit`]; infinite from an early end on
-    )
-    jacobian_error: FloatArray  # relative, (r, k) [%]; NaN where it is not known
-    step_time: FloatArray  # of all steps of the controller, (s,) [µs]
+    # Norm of the true error, (r, k) [`error_unit`]; infinite from an early end on.
+    error: FloatArray
+    jacobian_error: FloatArray  # relative error, (r, k) [%]; NaN where it is not known
+    step_time: FloatArray  # durations of all steps of the controller, (s,) [µs]
     settling_time: float  # median [s]; infinite if half of the runs never settled
     mostly_ended: bool  # whether half of the runs ended early, so that no median goes on to the end
     camera_moved_at: float  # when the camera was moved [s]; NaN where it was not
@@ -238,9 +240,10 @@ class Ensemble(Shown):
         """The error, (r, k) [`error_unit`]; along a curve its root mean square over `WINDOW`."""
         if self.point_to_point or not self.period < WINDOW:
             return self.error
+        periods = round(WINDOW / self.period)
         with np.errstate(invalid="ignore"):
             squares = pd.DataFrame(self.error.T**2).replace(math.inf, np.nan)
-            means = squares.rolling(round(WINDOW / self.period), min_periods=1).mean().to_numpy().T
+            means = squares.rolling(periods, min_periods=1).mean().to_numpy().T
         return np.where(np.isfinite(self.error), np.sqrt(means), self.error)
 
 
@@ -249,75 +252,88 @@ Ensembles = dict[str, Ensemble]
 
 def quantile(values: FloatArray, share: float) -> FloatArray:
     """Return a quantile over runs, (k,), of values (r, k) of which some may be infinite; NaN counts as the largest."""
-    ordered, place = np.sort(values, axis=0), share * (len(values) - 1)
-    below, part = math.floor(place), place - math.floor(place)
-    return np.asarray(
-        (1.0 - part) * ordered[below] + part * ordered[below + 1] if part else ordered[below]
-    )
+    ordered = np.sort(values, axis=0)
+    place = share * (len(values) - 1)
+    below = math.floor(place)
+    part = place - below
+    if not part:  # zero times an infinite value above would be NaN
+        return np.asarray(ordered[below])
+    return np.asarray((1.0 - part) * ordered[below] + part * ordered[below + 1])
 
 
 def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
-    share = (
-        results.read_manifest(folder).get("configuration", {}).get("run", {}).get("camera_moves_at")
-    )
-    share = share if isinstance(share, int | float) and 0.0 <= share < 1.0 else math.nan
-    tracks: dict[str, dict[str, list[Track]]] = {}
+    camera_moves_at = _camera_move(folder)
+    tracks: dict[tuple[str, str], list[Track]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
-        tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(
-            track
-        )
+        key = track.row["task"], track.row["controller"]
+        tracks.setdefault(key, []).append(track)
     unbegun = runs[(runs["status"] != COMPLETED) & (column_of(runs, "periods") == 0.0)]
     never = unbegun.groupby(["task", "controller"]).size()
-    return {
-        task: {
-            name: _ensemble(own, int(never.get((task, name), 0)), share)
-            for name, own in named.items()
-        }
-        for task, named in tracks.items()
-    }
+    ensembles: dict[str, Ensembles] = {}
+    for (task, name), own in tracks.items():
+        ensemble = _ensemble(own, int(never.get((task, name), 0)), camera_moves_at)
+        ensembles.setdefault(task, {})[name] = ensemble
+    return ensembles
+
+
+def _camera_move(folder: Path) -> float:
+    """Return after which share of a run the camera moves, by the manifest of a folder; NaN without one."""
+    configuration = results.read_manifest(folder).get("configuration", {})
+    share = configuration.get("run", {}).get("camera_moves_at")
+    if isinstance(share, int | float) and 0.0 <= share < 1.0:
+        return share
+    return math.nan
 
 
 def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
     """Return until when a figure shows these runs [s]: a move until well after the slowest method has settled."""
-    end = max(float(ensemble.time[-1]) for ensemble in ensembles.values())
-    times = [
-        ensemble.settling_time
-        for ensemble in ensembles.values()
-        if math.isfinite(ensemble.settling_time)
-    ]
-    moved = [ensemble.camera_moved_at for ensemble in ensembles.values()]
-    if not times or not next(iter(ensembles.values())).point_to_point or np.isfinite(moved).any():
+    each = list(ensembles.values())
+    end = max(float(ensemble.time[-1]) for ensemble in each)
+    settling_times = [ensemble.settling_time for ensemble in each]
+    known = [time for time in settling_times if math.isfinite(time)]
+    moved = any(math.isfinite(ensemble.camera_moved_at) for ensemble in each)
+    if not known or not each[0].point_to_point or moved:
         return end
-    return min(end, max(MARGIN * max(times), MIN_SHARE * end))
+    return min(end, max(MARGIN * max(known), MIN_SHARE * end))
 
 
 def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> Ensemble:
     """Return the ensemble of tracks and of runs that never began; a camera moves after that share of a run."""
-    runs, longest = (
-        pd.DataFrame([track.row for track in tracks]),
-        max(tracks, key=lambda track: len(track.table)),
-    )
-    moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
-    known = moves and not math.isnan(camera_moves_at)
-    moved_at = float(longest.time[int(camera_moves_at * len(longest.time))]) if known else math.nan
-    few = [track.thinned(len(longest.table) // OVERVIEW if longest.long else 1) for track in tracks]
+    runs = pd.DataFrame([track.row for track in tracks])
+    longest = max(tracks, key=lambda track: len(track.table))
+    # All runs of an ensemble are thinned alike, so that they have common instants.
+    step = len(longest.table) // OVERVIEW if longest.long else 1
+    few = [track.thinned(step) for track in tracks]
     time = max((track.time for track in few), key=len)
 
     def padded(values: FloatArray, filling: float) -> FloatArray:
         return np.concatenate([values, np.full(len(time) - len(values), filling)])
 
-    times = np.concatenate([track.column(STEP_TIME) for track in tracks])
+    errors = []
+    for track in few:
+        after_end = math.nan if track.completed else math.inf
+        errors.append(padded(track.error(), after_end))
+    errors += never * [np.full(len(time), math.inf)]
+    jacobian_errors = [padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]
+    step_times = np.concatenate([track.column(STEP_TIME) for track in tracks])
+    settled_after = [*settling_times(runs).fillna(math.inf), *never * [math.inf]]
+    ended_early = (runs["status"] != COMPLETED).sum() + never
     return Ensemble(
-        tracks[0].row,
-        time,
-        np.stack(
-            [padded(track.error(), math.nan if track.completed else math.inf) for track in few]
-            + never * [np.full(len(time), math.inf)]
-        ),
-        np.stack([padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]),
-        times[times > 0.0],
-        float(np.median([*settling_times(runs).fillna(math.inf), *never * [math.inf]])),
-        bool(((runs["status"] != COMPLETED).sum() + never) / (len(runs) + never) >= BAND[1]),
-        moved_at,
+        row=tracks[0].row,
+        time=time,
+        error=np.stack(errors),
+        jacobian_error=np.stack(jacobian_errors),
+        step_time=step_times[step_times > 0.0],
+        settling_time=float(np.median(settled_after)),
+        mostly_ended=bool(ended_early / (len(runs) + never) >= BAND[1]),
+        camera_moved_at=_camera_moved_at(runs, longest, camera_moves_at),
     )
+
+
+def _camera_moved_at(runs: pd.DataFrame, longest: Track, share: float) -> float:
+    """Return when the camera was moved [s], after a share of the longest run; NaN where it was not."""
+    moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
+    if not moves or math.isnan(share):
+        return math.nan
+    return float(longest.time[int(share * len(longest.time))])
