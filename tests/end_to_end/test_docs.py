@@ -242,7 +242,15 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     assert places == sorted(places)
     if find_browser() is not None:
         assert (
-            max(overhangs([tmp_path / "index.html", tmp_path / "methods_reference.html"], 1024))
+            max(
+                overhangs(
+                    [
+                        tmp_path / f"{name}.html"
+                        for name in ("index", "methods_reference", "settings")
+                    ],
+                    1024,
+                )
+            )
             <= 0
         )
     loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]*)"', index)

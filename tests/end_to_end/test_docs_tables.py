@@ -149,7 +149,7 @@ def test_every_diagnostic_is_told_and_exists(short_runs):
     found = {
         column for run in short_runs for column in run.steps if column.startswith("diagnostic_")
     }
-    rows = tables(section(read("methods_reference.md"), "Diagnostics"))[0][2]
+    rows = tables(section(read("settings.md"), "Diagnostics"))[0][2]
     assert {f"diagnostic_{name}" for row in rows for name in names(row[0])} == found
 
 
