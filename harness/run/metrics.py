@@ -290,7 +290,7 @@ _ALL: Final = (
     ),
     Metric(
         "rms_error_evaluated", "", "RMS error of the judged part", 2,
-        "root of the mean of e² over the judged part of the [task](plants.md#tasks); NaN if the run ended before it",
+        "root of the mean of e² over the judged part of the [task](tasks.md); NaN if the run ended before it",
         lambda run: _rms(run, run.evaluated),
         tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary(1, "curve"),
     ),

@@ -402,7 +402,7 @@ PROFILE_SETTINGS: Final[dict[str, dict[str, float]]] = {
         "sensing.feature_noise": 0.0034,
     }
 }
-"""Defaults of plants that come with a profile, by dotted key [s, m]; sources of all numbers are in docs/plants.md."""
+"""Defaults of plants that come with a profile, by dotted key [s, m]; sources of all numbers are in docs/mismatch.md."""
 USUAL_SHARE: Final = 0.3  # [1] beyond which a share without a unit is likely one of percent
 
 

@@ -114,7 +114,7 @@ def first_column(page, heading):
 def test_everything_registered_has_a_row_and_nothing_else_has():
     assert first_column("methods.md", "controller") == set(registry.CONTROLLERS)
     assert first_column("plants.md", "plant") == {*registry.PLANTS, "fmu:PATH.toml"}
-    assert first_column("plants.md", "task") == set(TASKS)
+    assert first_column("tasks.md", "task") == set(TASKS)
     assert set(LAWS) | set(ESTIMATORS) <= set(names(read("methods_reference.md")))
 
 
@@ -175,7 +175,7 @@ def test_the_plant_of_the_example_closes_a_loop(installed):
 def test_the_mapping_of_the_example_closes_a_loop_on_an_fmu(tmp_path):
     build_crane(tmp_path / "crane.fmu", 3)
     mapping = tmp_path / "crane.toml"
-    mapping.write_text(blocks(section(read("plants.md"), "`fmu:PATH.toml`, any FMU"), "toml")[0])
+    mapping.write_text(blocks(section(read("fmu.md"), "Every key of the mapping"), "toml")[0])
     plant = f"fmu:{mapping}"
     settings = read_settings(
         None,

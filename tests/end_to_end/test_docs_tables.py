@@ -199,7 +199,7 @@ def test_every_status_is_told_and_can_occur():
 
 
 def test_the_profiles_have_the_magnitudes_of_the_code():
-    rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "profile")
+    rows = next(rows for _, header, rows in tables(read("mismatch.md")) if header[0] == "profile")
     assert {names(row[0])[0] for row in rows} == set(PROFILES)
     for name, *cells in rows:
         links, offset, camera, tool, gear = (float(cell.split()[0].rstrip("°")) for cell in cells)
@@ -210,7 +210,7 @@ def test_the_profiles_have_the_magnitudes_of_the_code():
 
 
 def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
-    found = tables(read("plants.md"))
+    found = [*tables(read("mismatch.md")), *tables(read("sensor.md"))]
     axes = [names(row[1])[0] for _, header, rows in found if header[0] == "axis" for row in rows]
     words = [
         names(row[0])[0]
@@ -227,7 +227,7 @@ def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
 def test_the_keys_of_a_mapping_are_those_of_the_code():
     rows = next(
         rows
-        for _, header, rows in tables(read("plants.md"))
+        for _, header, rows in tables(read("fmu.md"))
         if header[0] == "key" and header[1] == "wanted"
     )
     mapping = FmuMapping(Path("crane.fmu"), ("push",), ("place",))

@@ -23,7 +23,7 @@ from servobench.harness.run.resolution import resolve
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
 from servobench.plant.contract.faults import ConfigurationError
 
-PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
+PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 (SPIRAL,) = (
     block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block
 )
