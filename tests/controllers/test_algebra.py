@@ -62,7 +62,8 @@ def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
 
 def test_each_lane_is_inverted_by_the_formula_that_is_accurate_for_it():
     """An ordinary Jacobian beside a huge singular one, of which the normal equations have no solution."""
-    ordinary, huge = np.random.default_rng(4).normal(size=(2, 2)), 1e9 * np.ones((2, 2))
+    ordinary = np.random.default_rng(4).normal(size=(2, 2))
+    huge = 1e9 * np.ones((2, 2))
     both = damped_inverse(np.array([ordinary, huge, ordinary]), 0.02)
     for lane, single in enumerate((ordinary, huge, ordinary)):
         np.testing.assert_array_equal(both[lane], damped_inverse(single, 0.02))

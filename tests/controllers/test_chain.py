@@ -20,7 +20,9 @@ from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, compose
 from servobench.plant.contract.signals import trusted_observation
 
 TURN = Rotation.from_rotvec(np.radians(100.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
-RESPONSE, GAIN, WEIGHT = (0.0, 0.6, 0.4), 14.0, 1e-9
+RESPONSE = (0.0, 0.6, 0.4)
+GAIN = 14.0
+WEIGHT = 1e-9
 
 
 def chain(**aids):
@@ -38,17 +40,19 @@ def test_the_error_of_what_the_arm_is_bound_for_contracts_as_promised():
 
     f is the share of the wanted feature step that the limits let through, γ = 1 − exp(−K dt).
     """
-    gamma, arm, target = (
-        1.0 - np.exp(-GAIN * PERIOD),
-        ToyArm(TURN, RESPONSE, latency=2),
-        np.array([0.9, 0.5, 0.2]),
-    )
-    servo, checked, limited, observation = chain(posture=False, filter=False), 0, 0, arm.observe()
+    gamma = 1.0 - np.exp(-GAIN * PERIOD)
+    arm = ToyArm(TURN, RESPONSE, latency=2)
+    target = np.array([0.9, 0.5, 0.2])
+    servo = chain(posture=False, filter=False)
+    checked = 0
+    limited = 0
+    observation = arm.observe()
     servo.reset(observation, 0)
     for k in range(60):
         e = target - arm.end()
         u = servo.step(observation, np.tile(target, (1 + PREVIEW, 1))).joint_velocity
-        observation, J = arm.step(u), servo.estimated_jacobian()
+        observation = arm.step(u)
+        J = servo.estimated_jacobian()
         after = target - arm.end()
         if k < 12 or np.linalg.norm(e) < 1e-6:
             continue
@@ -66,8 +70,10 @@ def test_the_error_of_what_the_arm_is_bound_for_contracts_as_promised():
 
 def following_error(**aids):
     """The largest error on a circle that moves by 7.5 mm a period, once it is followed, m."""
-    arm, servo = ToyArm(np.eye(M), RESPONSE, latency=1), chain(**aids)
-    observation, errors = arm.observe(), []
+    arm = ToyArm(np.eye(M), RESPONSE, latency=1)
+    servo = chain(**aids)
+    observation = arm.observe()
+    errors = []
     servo.reset(observation, 0)
 
     def desired(k):
@@ -89,23 +95,17 @@ def test_a_moving_reference_is_followed_with_a_tenth_of_a_period_of_lag():
 
 @pytest.mark.parametrize("aids", [{}, {"feedforward": True}, {"posture": False}])
 def test_the_command_that_is_sent_keeps_the_acceleration_limit_of_the_law(aids):
-    config, knowledge = (
-        METHODS["ukf_mpc"].config(),
-        dataclasses.replace(KNOWLEDGE, region=(np.zeros(N), np.full(N, 2.0))),
-    )
+    config = METHODS["ukf_mpc"].config()
+    knowledge = dataclasses.replace(KNOWLEDGE, region=(np.zeros(N), np.full(N, 2.0)))
     law = dataclasses.replace(
         config.law, joint_acceleration_limit=2.0, use_preview="feedforward" not in aids
     )
     config = dataclasses.replace(config, law=law, aids=dataclasses.replace(config.aids, **aids))
-    arm, servo, sent = (
-        ToyArm(np.eye(M), RESPONSE),
-        METHODS["ukf_mpc"].build(config, knowledge),
-        [np.zeros(N)],
-    )
-    observation, reference = (
-        arm.observe(),
-        0.1 * np.outer(np.arange(1.0 + PREVIEW), [1.0, 0.5, 0.0]),
-    )
+    arm = ToyArm(np.eye(M), RESPONSE)
+    servo = METHODS["ukf_mpc"].build(config, knowledge)
+    sent = [np.zeros(N)]
+    observation = arm.observe()
+    reference = 0.1 * np.outer(np.arange(1.0 + PREVIEW), [1.0, 0.5, 0.0])
     servo.reset(observation, 0)
     for _ in range(30):
         sent.append(servo.step(observation, reference).joint_velocity)
@@ -114,7 +114,8 @@ def test_the_command_that_is_sent_keeps_the_acceleration_limit_of_the_law(aids):
     assert np.abs(np.diff(sent, axis=0)).max() == pytest.approx(2.0 * PERIOD, rel=1e-6)
 
 
-LANES, PERIODS = 3, 42
+LANES = 3
+PERIODS = 42
 KNOWING = dataclasses.replace(
     KNOWLEDGE,
     true_jacobian=KNOWLEDGE.nominal_jacobian,
@@ -182,12 +183,12 @@ def lane_loop(servo, lanes):
     """
     rng = np.random.default_rng(3)
     turned = np.stack([A, -A + 0.05 * rng.normal(size=A.shape), A[[1, 2, 0]]])
-    noise, valid = (
-        0.001 * rng.normal(size=(PERIODS, LANES, M)),
-        rng.random((PERIODS, LANES, 1)) < 0.85,
-    )
+    noise = 0.001 * rng.normal(size=(PERIODS, LANES, M))
+    valid = rng.random((PERIODS, LANES, 1)) < 0.85
     valid = np.repeat(valid, M, axis=-1)
-    valid[0], valid[15:33, 1], valid[36:40, 2, 1] = True, False, False
+    valid[0] = True
+    valid[15:33, 1] = False
+    valid[36:40, 2, 1] = False
     goal = 0.2 * rng.normal(size=(LANES, M))
     goal[2] = 0.0
     phase = 0.1 * np.maximum(np.arange(PERIODS + PREVIEW + 1) - 15.0, 0.0)[:, None, None]
@@ -195,8 +196,12 @@ def lane_loop(servo, lanes):
     moved = np.where(
         (np.arange(PERIODS)[:, None, None] > 30) & (np.arange(LANES)[:, None] == 0), 0.5, 0.0
     )
-    delay, q = np.array([0, 3, 1])[lanes], np.zeros((*np.shape(lanes), N))
-    past, feature, found, state = [q] * 4, np.zeros((*np.shape(lanes), M)), [], None
+    delay = np.array([0, 3, 1])[lanes]
+    q = np.zeros((*np.shape(lanes), N))
+    past = [q] * 4
+    feature = np.zeros((*np.shape(lanes), M))
+    found = []
+    state = None
     for k in range(PERIODS):
         late = np.stack(past[-4:])[::-1]
         exposed = np.take_along_axis(late, np.asarray(delay)[None, ..., None], axis=0)[0]

@@ -42,16 +42,15 @@ def robot(n, m, seed):
     """What may be known about a made-up robot y = A sin(B q) of any size; its true Jacobian has other numbers."""
     rng = np.random.default_rng(seed)
     spec = plant_spec(n, m, rng.uniform(0.1, 3.0, n))
-    A, B = rng.normal(size=(m, n)), rng.normal(size=n)
+    A = rng.normal(size=(m, n))
+    B = rng.normal(size=n)
 
     def nominal_jacobian(q):
         return A * (B * np.cos(B * q))[..., None, :]
 
     def train_small(config):
-        jacobian, controller = (
-            JacobianTraining(centres=6, **SMALL),
-            ControllerTraining(hidden=6, **SMALL),
-        )
+        jacobian = JacobianTraining(centres=6, **SMALL)
+        controller = ControllerTraining(hidden=6, **SMALL)
         return train(
             dataclasses.replace(config, jacobian=jacobian, controller=controller),
             nominal_jacobian,
@@ -71,12 +70,11 @@ def robot(n, m, seed):
 
 def random_run(controller, spec, seed, scale, steps=12, start=True):
     """Feed random finite observations and return commands, Jacobians and diagnostics."""
-    rng, found = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    found = []
     for k in range(steps):
-        q, feature = (
-            rng.uniform(spec.joint_lower, spec.joint_upper),
-            rng.normal(scale=scale, size=spec.m),
-        )
+        q = rng.uniform(spec.joint_lower, spec.joint_upper)
+        feature = rng.normal(scale=scale, size=spec.m)
         observation = Observation(k * spec.period, q, feature, bool(rng.random() < 0.8))
         if k == 0 and start:
             controller.reset(observation, 0)
@@ -118,7 +116,8 @@ def test_a_method_keeps_the_contract_of_controllers(entry):
 @pytest.mark.parametrize("entry", COMPOSED)
 def test_reset_forgets_everything_also_while_the_jacobian_is_probed(entry):
     initial = InitialConfig(source="probe", probe_step=1e-3, settle_time=0.05, average_time=0.05)
-    knowledge, config = robot(5, 3, 7), dataclasses.replace(default_config(entry), initial=initial)
+    knowledge = robot(5, 3, 7)
+    config = dataclasses.replace(default_config(entry), initial=initial)
     controller = entry.build(config, knowledge)
     first = random_run(controller, knowledge.spec, 1, 0.5, 40)
     random_run(controller, knowledge.spec, 2, 0.5, 20)
@@ -142,14 +141,14 @@ def test_a_restored_controller_goes_on_as_the_saved_one_did(entry):
 @pytest.mark.parametrize("entry", COMPOSED)
 def test_estimator_law_and_servo_report_different_things(entry):
     knowledge = robot(4, 2, 3)
-    controller, names = (
-        entry.build(default_config(entry), knowledge),
-        ["probing", "jacobian_prediction_error"],
-    )
+    controller = entry.build(default_config(entry), knowledge)
+    names = ["probing", "jacobian_prediction_error"]
     (_, _, merged), *_ = random_run(controller, knowledge.spec, 3, 0.5)
     assert isinstance(controller, ServoController)
-    servo, state = controller.servo, controller.state
-    estimation, learned = servo.estimation, state.estimation.learned
+    servo = controller.servo
+    state = controller.state
+    estimation = servo.estimation
+    learned = state.estimation.learned
     names += [
         *estimation.estimator.diagnostics(learned.estimator),
         *servo.law.diagnostics(state.law),
@@ -165,10 +164,10 @@ def test_estimator_law_and_servo_report_different_things(entry):
 @pytest.mark.parametrize("entry", ALL)
 def test_what_is_of_the_wrong_size_or_not_finite_is_refused(entry):
     controller = entry.build(default_config(entry), robot(3, 2, 0))
-    good, narrow, tall, still = (
-        *(seen([0] * n, [0] * m) for n, m in ((3, 2), (2, 2), (3, 3))),
-        np.zeros((21, 2)),
-    )
+    good = seen([0] * 3, [0] * 2)
+    narrow = seen([0] * 2, [0] * 2)
+    tall = seen([0] * 3, [0] * 3)
+    still = np.zeros((21, 2))
     controller.reset(good, 0)
     for refused, arguments, message in (
         (

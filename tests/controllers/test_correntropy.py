@@ -17,7 +17,10 @@ from servobench.controllers.estimators.correntropy import (
     rmckf_estimator,
 )
 
-M, N, WALK, NOISE = 3, 4, 0.09, 0.001
+M = 3
+N = 4
+WALK = 0.09
+NOISE = 0.001
 FILTERS = {
     "mckf": (MckfConfig, mckf_estimator),
     "imcckf": (ImcckfConfig, imcckf_estimator),
@@ -29,9 +32,11 @@ FILTERS = {
 def published_fixed_point(x, P, H, z, R, kernel, tolerance, iterations):
     """Chen et al. (2017), algorithm 1, steps 3 to 6, with any kernel."""
     s = len(x)
-    B_p, B_r = np.linalg.cholesky(P), np.linalg.cholesky(R)
+    B_p = np.linalg.cholesky(P)
+    B_r = np.linalg.cholesky(R)
     B = block_diag(B_p, B_r)
-    D, W = np.linalg.solve(B, np.concatenate([x, z])), np.linalg.solve(B, np.vstack([np.eye(s), H]))
+    D = np.linalg.solve(B, np.concatenate([x, z]))
+    W = np.linalg.solve(B, np.vstack([np.eye(s), H]))
     last = x
     for _ in range(iterations):
         weights = kernel(D - W @ last)
@@ -56,7 +61,8 @@ def published_mckf(x, P, H, z, R, config):
 
 def published_gmckf(x, P, H, z, R, config):
     """Mo et al. (2022): the same with the weights of the generalised Gaussian density, its constant factors kept."""
-    a, b = config.shape, config.bandwidth
+    a = config.shape
+    b = config.bandwidth
 
     def generalised(e):
         size = np.maximum(np.abs(e), MIN_ERROR)
@@ -68,9 +74,12 @@ def published_gmckf(x, P, H, z, R, config):
 def published_imcckf(x, P, H, z, R, config):
     """Kulikova (2017), algorithm 1."""
     e = z - H @ x
-    weight = np.exp(-(e @ np.linalg.inv(R) @ e) / (2 * config.bandwidth**2))
-    K = weight * P @ H.T @ np.linalg.inv(weight * H @ P @ H.T + R)
-    return x + K @ e, (np.eye(len(x)) - K @ H) @ P
+    square = e @ np.linalg.inv(R) @ e
+    weight = np.exp(-square / (2 * config.bandwidth**2))
+    S = weight * H @ P @ H.T + R
+    K = weight * P @ H.T @ np.linalg.inv(S)
+    A = np.eye(len(x)) - K @ H
+    return x + K @ e, A @ P
 
 
 def published_rmckf(x, P, H, z, R, config):
@@ -78,8 +87,10 @@ def published_rmckf(x, P, H, z, R, config):
     B_r = np.linalg.cholesky(R)
     e = np.linalg.solve(B_r, z - H @ x)
     C = np.diag(np.exp(-(e**2) / (2 * config.bandwidth**2)))
-    R_tilde = B_r @ np.linalg.inv(C + config.regularisation * np.eye(len(z))) @ B_r.T
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R_tilde)
+    regularised = C + config.regularisation * np.eye(len(z))
+    R_tilde = B_r @ np.linalg.inv(regularised) @ B_r.T
+    S = H @ P @ H.T + R_tilde
+    K = P @ H.T @ np.linalg.inv(S)
     A = np.eye(len(x)) - K @ H
     return x + K @ (z - H @ x), A @ P @ A.T + K @ R @ K.T
 
@@ -104,14 +115,17 @@ def test_every_update_equals_the_published_formulas(name):
     kind, make = FILTERS[name]
     config = kind(initial_deviation=0.3, walk=WALK, feature_noise=NOISE)
     J = np.random.default_rng(1).normal(scale=0.4, size=(M, N))
-    run, x, P = Learning(make(config), J), J.ravel(), 0.09 * np.eye(M * N)
+    run = Learning(make(config), J)
+    x = J.ravel()
+    P = 0.09 * np.eye(M * N)
     assert run.diagnostics() == {
         "estimator_updated": False,
         "jacobian_deviation": pytest.approx(0.3),
     }
     for dq, dy in motions(40):
         run.update(motion(dq, dy))
-        H, R = np.kron(np.eye(M), dq), 2 * NOISE**2 * np.eye(M)
+        H = np.kron(np.eye(M), dq)
+        R = 2 * NOISE**2 * np.eye(M)
         x, P = PUBLISHED[name](x, P + WALK**2 * 0.05 * np.eye(M * N), H, dy, R, config)
         np.testing.assert_allclose(run.jacobian().ravel(), x, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(block_diag(*run.state.P), P, rtol=1e-12, atol=1e-12)

@@ -122,13 +122,17 @@ def test_the_first_step_of_least_squares_equals_the_one_computed_by_hand():
     ("alpha", "beta", "kappa"), [(1.0, 2.0, 0.0), (1.0, 0.0, 2.0), (0.1, 2.0, 0.0)]
 )
 def test_the_unscented_filter_equals_the_kalman_filter_over_1000_random_steps(alpha, beta, kappa):
-    n, m = 6, 3
+    n = 6
+    m = 3
     rng = np.random.default_rng(5)
     A, B = (rng.normal(size=(n * m, n * m)) for _ in range(2))
-    Q, r = 1e-6 * (A @ A.T), np.float64(4e-6)
+    Q = 1e-6 * (A @ A.T)
+    r = np.float64(4e-6)
     J = rng.normal(scale=0.4, size=(m, n))
     P = 1e-3 * (B @ B.T)
-    J_kalman, P_kalman, config = J, P, UkfConfig(alpha=alpha, beta=beta, kappa=kappa)
+    J_kalman = J
+    P_kalman = P
+    config = UkfConfig(alpha=alpha, beta=beta, kappa=kappa)
     for dq, dy in random_motions(n, m, 1000):
         J, P = unscented_update(J, P + Q, dq, dy, r=r, config=config)
         J_kalman, P_kalman = kalman_update(J_kalman, P_kalman + Q, dq, dy, r=r)
@@ -157,7 +161,8 @@ def test_the_split_forms_equal_the_full_ones(n, m):
 
 
 def test_joseph_form_keeps_the_covariance_positive_definite_under_nearly_exact_measurements():
-    P, J = np.eye(6) * 1e4, np.zeros((3, 6))
+    P = np.eye(6) * 1e4
+    J = np.zeros((3, 6))
     rng = np.random.default_rng(8)
     for _ in range(2000):
         dq = rng.normal(size=6)
@@ -174,7 +179,8 @@ def test_the_weights_of_sigma_points_are_those_computed_by_hand():
 
 
 def test_least_squares_forgets_by_the_time_of_a_motion():
-    dq, dy = np.array([0.1, -0.2]), np.array([0.3])
+    dq = np.array([0.1, -0.2])
+    dy = np.array([0.3])
     estimator = RlsEstimator(RlsConfig(memory=2.0))
     begun = estimator.start(np.zeros((1, 2)))
     for duration in (0.1, 0.5):
@@ -187,11 +193,9 @@ def test_least_squares_forgets_by_the_time_of_a_motion():
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4))
 def test_the_compact_form_without_regularisation_is_broydens_update(seed, n, m):
     rng = np.random.default_rng(seed)
-    J, dq, dy = (
-        rng.normal(size=(m, n)),
-        rng.normal(scale=0.1, size=n),
-        rng.normal(scale=0.1, size=m),
-    )
+    J = rng.normal(size=(m, n))
+    dq = rng.normal(scale=0.1, size=n)
+    dy = rng.normal(scale=0.1, size=m)
     broyden = ProjectionEstimator(BroydenConfig(step_factor=1.0, min_joint_step=1e-9))
     compact = ProjectionEstimator(
         CfdlConfig(step_factor=1.0, regularisation=1e-300, min_joint_step=0.0, reset=False)
@@ -203,7 +207,9 @@ def test_the_compact_form_without_regularisation_is_broydens_update(seed, n, m):
 
 def test_broydens_update_is_the_smallest_change_that_explains_the_motion():
     rng = np.random.default_rng(4)
-    J, dq, dy = rng.normal(size=(3, 6)), rng.normal(size=6), rng.normal(size=3)
+    J = rng.normal(size=(3, 6))
+    dq = rng.normal(size=6)
+    dy = rng.normal(size=3)
     change = projection_update(J, dq, dy, step_factor=1.0, regularisation=0.0) - J
     smallest = np.linalg.lstsq(np.kron(np.eye(3), dq), dy - J @ dq, rcond=None)[0].reshape(3, 6)
     np.testing.assert_allclose(change, smallest, atol=1e-13)
@@ -212,21 +218,28 @@ def test_broydens_update_is_the_smallest_change_that_explains_the_motion():
 @pytest.mark.parametrize("forgetting", [1.0, 0.9])
 def test_recursive_least_squares_equals_weighted_batch_least_squares(forgetting):
     rng = np.random.default_rng(6)
-    n, m, count = 6, 3, 40
-    J0, P0 = rng.normal(size=(m, n)), np.diag(rng.uniform(1.0, 5.0, n))
-    DQ, DY = rng.normal(size=(count, n)), rng.normal(size=(count, m))
-    J, P = J0, P0
+    n = 6
+    m = 3
+    count = 40
+    J0 = rng.normal(size=(m, n))
+    P0 = np.diag(rng.uniform(1.0, 5.0, n))
+    DQ = rng.normal(size=(count, n))
+    DY = rng.normal(size=(count, m))
+    J = J0
+    P = P0
     for dq, dy in zip(DQ, DY, strict=True):
         J, P = rls_update(J, P, dq, dy, forgetting=np.asarray(forgetting))
     weights = np.sqrt(forgetting ** np.arange(count - 1, -1, -1))[:, None]
     prior = np.sqrt(forgetting**count) * np.diag(1 / np.sqrt(np.diag(P0)))
-    A, B = np.vstack([weights * DQ, prior]), np.vstack([weights * DY, prior @ J0.T])
+    A = np.vstack([weights * DQ, prior])
+    B = np.vstack([weights * DY, prior @ J0.T])
     np.testing.assert_allclose(J, np.linalg.lstsq(A, B, rcond=None)[0].T, atol=1e-10)
     np.testing.assert_allclose(P, np.linalg.inv(A.T @ A), rtol=1e-9, atol=1e-12)
 
 
 def test_forgetting_does_not_wind_up_while_one_joint_rests():
-    run, config = Learning(RlsEstimator(RlsConfig()), np.zeros((1, 3))), RlsConfig()
+    run = Learning(RlsEstimator(RlsConfig()), np.zeros((1, 3)))
+    config = RlsConfig()
     assert run.diagnostics()["covariance_mean"] == pytest.approx(config.initial_covariance)
     rng = np.random.default_rng(1)
     for _ in range(2000):

@@ -34,7 +34,8 @@ def probe(plant, seed=0, **settings):
         InitialConfig(source="probe", **settings), RobotKnowledge(plant.spec, 0)
     )
     observation = plant.reset(seed)
-    state, periods = provider.start(observation), 0
+    state = provider.start(observation)
+    periods = 0
     while True:
         state, u, done = provider.step(state, observation)
         if done:
@@ -60,7 +61,8 @@ def test_probing_through_default_noise_is_as_good_as_the_averaged_noise_allows()
 
 
 def test_probing_takes_the_periods_that_its_settings_tell():
-    plant, config = kinematic(), InitialConfig(source="probe")
+    plant = kinematic()
+    config = InitialConfig(source="probe")
     _, periods = probe(plant)
     each = config.probe_time + config.settle_time + config.average_time
     assert periods == round((config.average_time + 6 * each) / 0.05) - 1 - 6
@@ -102,11 +104,9 @@ def test_a_probing_move_turns_away_from_a_joint_limit():
 
 
 def test_a_joint_that_does_not_move_is_a_named_fault():
-    provider, q, done = (
-        initial_jacobian(InitialConfig("probe"), RobotKnowledge(plant_spec(3, 1), 0)),
-        np.zeros(3),
-        False,
-    )
+    provider = initial_jacobian(InitialConfig("probe"), RobotKnowledge(plant_spec(3, 1), 0))
+    q = np.zeros(3)
+    done = False
     state = provider.start(Observation(0.0, q, np.zeros(1)))
     while not done:
         state, u, done = provider.step(state, Observation(0.0, q, np.zeros(1)))
@@ -116,14 +116,16 @@ def test_a_joint_that_does_not_move_is_a_named_fault():
 
 
 def test_a_controller_says_that_it_probes_and_servoes_afterwards():
-    entry, plant = compose("mfac", "kalman"), kinematic()
+    entry = compose("mfac", "kalman")
+    plant = kinematic()
     controller = entry.build(
         replace(entry.config(), initial=InitialConfig(source="probe")),
         RobotKnowledge(plant.spec, 0),
     )
     observation = plant.reset(1)
     controller.reset(observation, 1)
-    goal, probing = plant.truth().feature + 0.1, []
+    goal = plant.truth().feature + 0.1
+    probing = []
     for _ in range(160):
         observation = plant.step(controller.step(observation, goal[None, :]))
         probing.append(controller.diagnostics()["probing"])

@@ -28,7 +28,8 @@ def fresh(n, m, limit=1e6, preview=1, **settings):
 )
 def test_the_step_minimises_error_plus_weighted_motion(seed, n, m, lam):
     rng = np.random.default_rng(seed)
-    J, e = rng.normal(size=(m, n)), rng.normal(size=m)
+    J = rng.normal(size=(m, n))
+    e = rng.normal(size=m)
     stacked = np.vstack([J, np.sqrt(lam) * np.eye(n)])
     expected = np.linalg.lstsq(stacked, np.concatenate([e, np.zeros(n)]), rcond=None)[0]
     np.testing.assert_allclose(mfac_step(J, e, 1.0, lam), expected, atol=1e-10)
@@ -36,8 +37,10 @@ def test_the_step_minimises_error_plus_weighted_motion(seed, n, m, lam):
 
 def test_with_the_exact_jacobian_and_no_weight_an_affine_plant_arrives_in_one_step():
     rng = np.random.default_rng(2)
-    J, y = rng.normal(size=(3, 6)), rng.normal(size=3)
-    law, ref = fresh(6, 3, gain=math.inf, step_weight=1e-13), rng.normal(size=(2, 3))
+    J = rng.normal(size=(3, 6))
+    y = rng.normal(size=3)
+    law = fresh(6, 3, gain=math.inf, step_weight=1e-13)
+    ref = rng.normal(size=(2, 3))
     u = law.command(Estimate(J), seen(np.zeros(6), y), ref)
     np.testing.assert_allclose(y + J @ u * 0.05, ref[0], atol=1e-10)
 
@@ -46,10 +49,13 @@ def test_with_the_exact_jacobian_and_no_weight_an_affine_plant_arrives_in_one_st
 def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_derivations_says(
     seed, degrees, share
 ):
-    rng, turn = np.random.default_rng(seed), math.radians(degrees)
-    J, R = rng.normal(size=(3, 6)), Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
+    rng = np.random.default_rng(seed)
+    turn = math.radians(degrees)
+    J = rng.normal(size=(3, 6))
+    R = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
     law = fresh(6, 3, gain=-math.log1p(-share) / PERIOD, step_weight=1e-13)
-    across, along = np.array([math.cos(seed), math.sin(seed), 0.0]), np.array([0.0, 0.0, 1.0])
+    across = np.array([math.cos(seed), math.sin(seed), 0.0])
+    along = np.array([0.0, 0.0, 1.0])
     factors = []
     for error in (across, along):
         u = law.command(Estimate(J), seen(np.zeros(6), -error), np.zeros((2, 3)))

@@ -17,7 +17,8 @@ from servobench.controllers.networks.rbf import (
 def controller_network(
     n=3, m=2, hidden=5, error_history=2, position_history=1, kernel="exponential", seed=0
 ):
-    rng, p = np.random.default_rng(seed), m * error_history + n * position_history
+    rng = np.random.default_rng(seed)
+    p = m * error_history + n * position_history
     arrays = (
         rng.normal(size=(hidden, p)),
         rng.uniform(1.0, 2.0, hidden),
@@ -27,7 +28,8 @@ def controller_network(
 
 
 def test_the_jacobian_equals_a_plain_loop_over_columns_and_units():
-    network, q = jacobian_network(), np.array([0.3, -0.2, 0.9])
+    network = jacobian_network()
+    q = np.array([0.3, -0.2, 0.9])
     J = np.zeros((2, 3))
     for i in range(3):
         for unit in range(4):
@@ -87,7 +89,8 @@ def test_the_quick_features_of_the_controller_network_are_those_of_the_plain_for
 
 @pytest.mark.parametrize(("kernel", "power"), [("exponential", 1), ("gaussian", 2)])
 def test_the_controller_equals_a_plain_loop_with_the_norm_squared_only_on_request(kernel, power):
-    network, xi = controller_network(kernel=kernel), np.random.default_rng(2).normal(size=7)
+    network = controller_network(kernel=kernel)
+    xi = np.random.default_rng(2).normal(size=7)
     q = np.zeros(3)
     for j in range(7):
         for unit in range(5):
@@ -110,7 +113,8 @@ def test_networks_are_read_only():
         jacobian_network().weights[0, 0, 0] = 1.0
 
 
-GOOD, CONTROLLER = jacobian_network(), controller_network()
+GOOD = jacobian_network()
+CONTROLLER = controller_network()
 
 
 @pytest.mark.parametrize(

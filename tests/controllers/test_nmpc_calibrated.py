@@ -60,7 +60,8 @@ def test_first_step_by_hand():
 
 def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
     rng = np.random.default_rng(0)
-    J, offset = rng.normal(size=(2, 4)), rng.normal(size=2)
+    J = rng.normal(size=(2, 4))
+    offset = rng.normal(size=2)
     spec = plant_spec(4, 2)
     common = {"horizon_time": 0.3, "moves": 6, "decay": 8.0, "move_weight": 0.05, "delay": 0.1}
     law = MpcLaw(MpcConfig(**common, joint_acceleration_limit=8.0), RobotKnowledge(spec, 12))
@@ -126,7 +127,8 @@ def commands(target, *, offset=(0.0, 0.0, 0.0), latency=0.0, disturb=None, perio
     """Return the commands of a loop of ideal joints and, at its end, the error of the feature at the target."""
     known = replace(knowledge(), true_delays=Delays(latency, 0.0, 0.0, changes.pop("spread", 0.0)))
     controller = NmpcCalibrated(NmpcCalibratedConfig(delay=0.0, **changes), known)
-    joints, found = [START], []
+    joints = [START]
+    found = []
     for k in range(periods):
         age = round(latency / 0.05) if disturb is None else disturb(k)
         measured = (
@@ -186,7 +188,8 @@ def test_a_camera_that_is_known_to_turn_shows_the_target_in_its_place():
         controller = NmpcCalibrated(
             NmpcCalibratedConfig(image=image), replace(knowledge(), true_camera_turn=0.3)
         )
-        joints, errors = START, []
+        joints = START
+        errors = []
         for k in range(60):
             feature = seen(joints, 0.05 * k)
             command = controller.step(Observation(0.05 * k, joints, feature), hold(TARGET))
@@ -196,11 +199,14 @@ def test_a_camera_that_is_known_to_turn_shows_the_target_in_its_place():
 
 
 def test_the_taps_leave_an_oscillator_at_rest_after_a_step():
-    omega, damping, period = 20.0, 0.1, 0.001
+    omega = 20.0
+    damping = 0.1
+    period = 0.001
     taps = zero_vibration_taps(omega, damping, period)
     assert taps.sum() == pytest.approx(1.0)
     np.testing.assert_array_equal(zero_vibration_taps(0.0, 0.02, 0.05), [1.0])
-    A, B = [[0.0, 1.0], [-(omega**2), -2.0 * damping * omega]], [[0.0], [omega**2]]
+    A = [[0.0, 1.0], [-(omega**2), -2.0 * damping * omega]]
+    B = [[0.0], [omega**2]]
     step = np.cumsum(np.pad(taps, (0, 1000)))
     swing = lsim((A, B, [[1.0, 0.0]], 0.0), step, period * np.arange(len(step)), interp=False)[1]
     alone = lsim((A, B, [[1.0, 0.0]], 0.0), np.ones(1000), period * np.arange(1000), interp=False)[

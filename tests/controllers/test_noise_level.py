@@ -21,10 +21,13 @@ def learned(level, innovations, multiple, other):
 
 
 def test_it_is_the_mean_of_the_posterior_on_the_grid():
-    """ln σ of normal innovations of variance a σ² + b; of scores that are told, 0.99 of each is kept per sample."""
-    rng, a, b = np.random.default_rng(1), 1.7, 3e-6
+    """ln σ of normal innovations of variance a σ² + b; of each score 0.99 is kept per sample."""
+    rng = np.random.default_rng(1)
+    a = 1.7
+    b = 3e-6
     innovations = 4e-3 * rng.normal(size=(6, 3))
-    kept, deviation = 0.99 ** np.arange(6)[::-1], np.sqrt(a * GRID[:, None, None] ** 2 + b)
+    kept = 0.99 ** np.arange(6)[::-1]
+    deviation = np.sqrt(a * GRID[:, None, None] ** 2 + b)
     log = norm(scale=deviation).logpdf(innovations).sum(axis=-1) @ kept
     log = log + 0.99**6 * norm(np.log(GUESS), 1.5).logpdf(np.log(GRID))
     level = learned(NoiseLevel.start(GUESS), innovations, a, b)
@@ -41,21 +44,16 @@ def test_before_there_is_an_innovation_it_is_the_guess():
 
 @pytest.mark.parametrize("size", [0.5, 3.0])
 def test_outliers_count_for_no_level_more_than_for_another(size):
-    """Their density does not depend on σ: what the other frames told is flattened by forgetting alone."""
+    """Their density does not depend on σ: what the other frames showed is flattened by forgetting alone."""
     rng = np.random.default_rng(2)
-    level = learned(
-        NoiseLevel.start(GUESS), np.sqrt(2.0) * 2.0 * GUESS * rng.normal(size=(100, 3)), 2.0, 0.0
-    )
+    innovations = np.sqrt(2.0) * 2.0 * GUESS * rng.normal(size=(100, 3))
+    level = learned(NoiseLevel.start(GUESS), innovations, 2.0, 0.0)
     after = learned(level, size * rng.normal(size=(5, 3)), 2.0, 0.0)
     np.testing.assert_allclose(after.scores, 0.99**5 * level.scores, rtol=1e-9, atol=1e-9)
     assert after.deviation == pytest.approx(level.deviation, rel=0.02)
-    share = np.mean(
-        [
-            learned(NoiseLevel.start(GUESS), part, 2.0, 0.0).deviation
-            for part in frames_with_outliers(rng)
-        ]
-    )
-    assert share == pytest.approx(2.0 * GUESS, rel=0.2)
+    runs = frames_with_outliers(rng)
+    levels = [learned(NoiseLevel.start(GUESS), run, 2.0, 0.0).deviation for run in runs]
+    assert np.mean(levels) == pytest.approx(2.0 * GUESS, rel=0.2)
 
 
 def frames_with_outliers(rng):
@@ -84,7 +82,8 @@ LANES = 2_000  # numpy's power of a number differs from that of an array once in
 def test_many_lanes_have_the_bits_of_each_alone():
     rng = np.random.default_rng(1)
     square, other = 10.0 ** rng.uniform(-8, -1, (2, LANES))
-    multiple, count = rng.uniform(1.0, 2.0, LANES), rng.integers(1, 4, LANES)
+    multiple = rng.uniform(1.0, 2.0, LANES)
+    count = rng.integers(1, 4, LANES)
     square[::7] = 0.0
     level = (
         NoiseLevel.start(GUESS, (LANES,))
@@ -92,7 +91,10 @@ def test_many_lanes_have_the_bits_of_each_alone():
         .learn(other, count, multiple, square)
     )
     for lane in range(LANES):
-        a, b, c, d = square[lane], other[lane], count[lane], multiple[lane]
+        a = square[lane]
+        b = other[lane]
+        c = count[lane]
+        d = multiple[lane]
         alone = NoiseLevel.start(GUESS).learn(a, c, d, b).learn(b, c, d, a)
         for one, among in zip(alone, level, strict=True):
             np.testing.assert_array_equal(one, among[lane])

@@ -15,10 +15,8 @@ from servobench.controllers.periods import check_preview, in_periods, sampled
     st.integers(0, 99),
 )
 def test_samples_are_those_of_linear_interpolation(count, shares, lead, seed):
-    rows, places = (
-        np.random.default_rng(seed).normal(size=(*lead, count, 2)),
-        np.array(shares) * (count - 1) / 1000,
-    )
+    rows = np.random.default_rng(seed).normal(size=(*lead, count, 2))
+    places = np.array(shares) * (count - 1) / 1000
     wanted = np.apply_along_axis(lambda line: np.interp(places, np.arange(count), line), -2, rows)
     np.testing.assert_allclose(sampled(rows, places), wanted, atol=1e-12)
 

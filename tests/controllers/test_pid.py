@@ -42,13 +42,14 @@ def test_the_derivative_is_the_filtered_difference_of_the_error_and_the_first_er
     # d = 0, then (0.15 · 0 + 0.3 − 0.1) / (0.15 + 0.05) = 1, then (0.15 · 1 + 0.4 − 0.3) / (0.15 + 0.05) = 1.25
     for error, d in ((0.1, 0.0), (0.3, 1.0), (0.4, 1.25)):
         u = law.command(Estimate(J), look([-error, 0.0]), np.zeros((2, 2)))
-        np.testing.assert_allclose(
-            J @ u, [error * (1.0 - np.exp(-0.05)) / 0.05 + d, 0.0], atol=1e-14
-        )
+        proportional = error * (1.0 - np.exp(-0.05)) / 0.05
+        np.testing.assert_allclose(J @ u, [proportional + d, 0.0], atol=1e-14)
 
 
 def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():
-    law, y, ref = fresh(proportional_gain=3.0), np.array([0.2, -0.1]), np.array([[0.5, 0.3]] * 2)
+    law = fresh(proportional_gain=3.0)
+    y = np.array([0.2, -0.1])
+    ref = np.array([[0.5, 0.3]] * 2)
     for _ in range(50):
         e = ref[0] - y
         y = y + J @ law.command(Estimate(J), look(y), ref) * 0.05
@@ -82,7 +83,8 @@ def test_an_invalid_feature_leaves_integral_and_derivative_alone():
 
 
 def test_a_feature_that_was_lost_for_a_while_gives_the_derivative_no_kick():
-    law, v = fresh(proportional_gain=1e-9, derivative_gain=1.0), []
+    law = fresh(proportional_gain=1e-9, derivative_gain=1.0)
+    v = []
     for k in range(60):
         u = law.command(
             Estimate(J), look([-0.01 * k, 0.0], valid=k < 40 or k == 59), np.zeros((2, 2))

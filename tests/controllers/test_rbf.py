@@ -24,11 +24,9 @@ def started(config, net):
 
 def window(net, count, seed=1):
     rng = np.random.default_rng(seed)
-    q, dq, dy = (
-        rng.normal(size=(count, net.n)),
-        rng.normal(size=(count, net.n)),
-        rng.normal(size=(count, net.m)),
-    )
+    q = rng.normal(size=(count, net.n))
+    dq = rng.normal(size=(count, net.n))
+    dy = rng.normal(size=(count, net.m))
     return jacobian_features(q, net.centres, net.widths), net.features(q), dq, dy
 
 
@@ -77,13 +75,15 @@ def test_epsilon_grows_with_the_square_of_the_noise_that_is_known():
     estimator.update(replace(motion([0.1], [0.5]), noise=np.asarray(0.002)))
     assert estimator.diagnostics()["estimator_step_size"] == pytest.approx(10.0)
     # Two motions of two joints: α₂ = 0.5 / (0.01 + 0.12 + 0.18 + 0.01 · 8 / 4)
-    sizes, steps = np.array([[1.0, 3.0], [2.0, 2.0]]), np.array([[0.1, 0.2], [0.3, 0.0]])
+    sizes = np.array([[1.0, 3.0], [2.0, 2.0]])
+    steps = np.array([[0.1, 0.2], [0.3, 0.0]])
     assert window_step(sizes, steps, np.int_(2), 0.5, 0.01) == pytest.approx(0.5 / 0.33)
 
 
 @pytest.mark.parametrize("k2", [0.1, 1.0, 1.9])
 def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
-    true, rng = network(seed=5), np.random.default_rng(6)
+    true = network(seed=5)
+    rng = np.random.default_rng(6)
     start = JacobianNetwork(
         true.centres, true.widths, true.weights + rng.normal(size=true.weights.shape)
     )
@@ -91,7 +91,8 @@ def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
     V = np.sum((estimator.state.rows - true.rows) ** 2)
     first = V
     for _ in range(200):
-        q, dq = rng.normal(size=3), rng.normal(size=3)
+        q = rng.normal(size=3)
+        dq = rng.normal(size=3)
         estimator.update(motion(dq, true.jacobian(q) @ dq, q=q))
         V, before = np.sum((estimator.state.rows - true.rows) ** 2), V
         assert before * (1 + 1e-12) >= V
@@ -105,7 +106,8 @@ def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
 
 
 def test_only_the_last_motions_of_the_window_count():
-    net, rng = network(), np.random.default_rng(9)
+    net = network()
+    rng = np.random.default_rng(9)
     motions = [
         motion(rng.normal(size=3), rng.normal(size=2), q=rng.normal(size=3)) for _ in range(5)
     ]
@@ -124,7 +126,8 @@ def test_only_the_last_motions_of_the_window_count():
 
 
 def test_what_was_learned_fades_by_its_leak_per_second():
-    net, leak = network(), 0.4
+    net = network()
+    leak = 0.4
     keeping, fading = (started(RbfConfig(leak=each), net) for each in (0.0, leak))
     moved = motion([0.1, -0.2, 0.05], [0.01, 0.02])
     for estimator in (keeping, fading):
@@ -137,7 +140,8 @@ def test_what_was_learned_fades_by_its_leak_per_second():
 
 
 def test_a_kept_value_is_returned_only_for_the_same_position_and_weights():
-    net, (first, second) = network(), np.random.default_rng(5).normal(size=(2, 3))
+    net = network()
+    first, second = np.random.default_rng(5).normal(size=(2, 3))
     run = started(RbfConfig(), net)
     for q in (first, first, second, first):
         np.testing.assert_array_equal(run.estimator.features(q), net.features(q))
@@ -168,12 +172,18 @@ def test_the_first_lyapunov_update_equals_the_one_computed_by_hand():
 
 def lyapunov_run(gain=4.0, dt=1e-3, steps=1500):
     """Return V and its predicted rate along u = K_p Ĵ⁺ e on the plant ẏ = J(q) q̇ whose J the network can represent."""
-    true, config, rng = network(seed=3), RbfLyapunovConfig(n2=0.5, n3=0.5), np.random.default_rng(4)
+    true = network(seed=3)
+    config = RbfLyapunovConfig(n2=0.5, n3=0.5)
+    rng = np.random.default_rng(4)
     weights = true.weights + 0.2 * rng.normal(size=true.weights.shape)
     estimator = started_lyapunov(config, JacobianNetwork(true.centres, true.widths, weights))
-    q, e, V, rate = np.array([0.2, -0.1, 0.3]), np.array([0.3, -0.2]), [], []
+    q = np.array([0.2, -0.1, 0.3])
+    e = np.array([0.3, -0.2])
+    V = []
+    rate = []
     for _ in range(steps):
-        J_hat, J = estimator.jacobian(q), true.jacobian(q)
+        J_hat = estimator.jacobian(q)
+        J = true.jacobian(q)
         u = gain * np.linalg.pinv(J_hat) @ e
         s = J @ u - J_hat @ u
         V.append(0.5 * config.n2 * e @ e + 0.5 * np.sum((true.rows - estimator.state.rows) ** 2))

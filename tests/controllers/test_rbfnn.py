@@ -32,8 +32,10 @@ ONES = Estimate(np.ones((2, 3)))
 
 def network(n=3, m=2, hidden=4, error_history=1, position_history=1, seed=0):
     """A network whose output stays near the newest joint position: ψ = [small, I, 0] plus small random weights."""
-    rng, p = np.random.default_rng(seed), m * error_history + n * position_history
-    centres, widths = rng.normal(size=(hidden, p)), rng.uniform(2.0, 3.0, hidden)
+    rng = np.random.default_rng(seed)
+    p = m * error_history + n * position_history
+    centres = rng.normal(size=(hidden, p))
+    widths = rng.uniform(2.0, 3.0, hidden)
     weights = 0.02 * rng.normal(size=(n, p, hidden))
     start = m * error_history
     weights[:, start : start + n, :] += np.eye(n)[:, :, None] / hidden
@@ -70,7 +72,9 @@ def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit
     net = network(error_history=error_history, position_history=position_history)
     net = replace(net, offset_free=offset_free)
     J, (errors, positions), steps, ahead = case(net, limit=limit)
-    e_list, q_list, wanted = list(errors), list(positions), []
+    e_list = list(errors)
+    q_list = list(positions)
+    wanted = []
     for t in range(4):
         xi = np.concatenate([*e_list[:error_history], *q_list[:position_history]])
         h = np.exp(-np.linalg.norm(xi - net.centres, axis=1) / net.widths**2)
@@ -118,12 +122,10 @@ def test_the_direction_is_that_of_automatic_differentiation_of_each_term_through
 def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself(k, row_space_only):
     net = network()
     rng = np.random.default_rng(2)
-    J, q, y, ref = (
-        rng.normal(size=(2, 3)),
-        rng.normal(size=3),
-        rng.normal(size=2),
-        rng.normal(size=2),
-    )
+    J = rng.normal(size=(2, 3))
+    q = rng.normal(size=3)
+    y = rng.normal(size=2)
+    ref = rng.normal(size=2)
     made = law(net, horizon=1, k=k, epsilon=0.0, row_space_only=row_space_only)
     xi = information_vector((ref - y)[None], q[None])
     before = ref - y - J @ (net.command(xi) - q)
@@ -136,14 +138,14 @@ def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself(k, row_
 def test_the_first_step_equals_the_one_computed_by_hand():
     # ξ = [e, q] = [0.4, 1], h = exp(−0) = 1 with the centre on ξ; ψ = [0.5, 1]: q_cmd = 1.2, e(k+1) = 0.4 − 2 · 0.2 = 0
     net = ControllerNetwork(np.array([[0.4, 1.0]]), np.ones(1), np.array([[[0.5], [1.0]]]), 1, 1)
-    u = law(net, horizon=1, k=0.5, epsilon=0.0).command(
-        Estimate(np.array([[2.0]])), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
-    )
+    observation = seen([1.0], [0.0])
+    reference = np.full((PREVIEW + 1, 1), 0.4)
+    made = law(net, horizon=1, k=0.5, epsilon=0.0)
+    u = made.command(Estimate(np.array([[2.0]])), observation, reference)
     np.testing.assert_allclose(u, [0.2 / PERIOD], rtol=1e-12)
     # with Ĵ = 1: e(k+1) = 0.2, G = 0.2 · [0.4, 1], α = 0.5 · 0.04 / 0.0464, dq = 0.2 + α · 0.2 · 1.16 = 0.3
-    u = law(net, horizon=1, k=0.5, epsilon=0.0).command(
-        Estimate(np.array([[1.0]])), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
-    )
+    made = law(net, horizon=1, k=0.5, epsilon=0.0)
+    u = made.command(Estimate(np.array([[1.0]])), observation, reference)
     np.testing.assert_allclose(u, [0.3 / PERIOD], rtol=1e-12)
 
 
@@ -151,8 +153,10 @@ def test_the_first_step_equals_the_one_computed_by_hand():
 def test_without_an_error_the_offset_free_law_rests_also_far_from_where_its_network_was_trained(
     far,
 ):
-    q, y = np.full(3, far), np.array([0.3, -0.2])
-    observation, reference = seen(q, y), np.tile(y, (PREVIEW + 1, 1))
+    q = np.full(3, far)
+    y = np.array([0.3, -0.2])
+    observation = seen(q, y)
+    reference = np.tile(y, (PREVIEW + 1, 1))
     printed, ours = (
         law(network(), offset_free=free).command(ONES, observation, reference)
         for free in (False, True)
@@ -163,19 +167,16 @@ def test_without_an_error_the_offset_free_law_rests_also_far_from_where_its_netw
 
 def null_motion(row_space_only):
     """Return how fast a law, taught under one Jacobian, moves in the null space of another at zero error."""
-    made, rng = law(network(), row_space_only=row_space_only), np.random.default_rng(6)
+    made = law(network(), row_space_only=row_space_only)
+    rng = np.random.default_rng(6)
     J, J_later = rng.normal(size=(2, 2, 3))
+    q = np.zeros(3) + 0.5
+    reference = np.ones((PREVIEW + 1, 2))
     for _ in range(20):
-        made.command(Estimate(J), seen(np.zeros(3) + 0.5, np.zeros(2)), np.ones((PREVIEW + 1, 2)))
-    before = law(network()).command(
-        Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))
-    )
-    u = (
-        made.command(
-            Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))
-        )
-        - before
-    )
+        made.command(Estimate(J), seen(q, np.zeros(2)), reference)
+    at_target = seen(q, np.ones(2))
+    before = law(network()).command(Estimate(J_later), at_target, reference)
+    u = made.command(Estimate(J_later), at_target, reference) - before
     return np.linalg.norm(u - np.linalg.pinv(J_later) @ J_later @ u)
 
 
@@ -210,7 +211,8 @@ def without_preview():
 def test_the_preview_is_used_only_where_it_is_switched_on():
     ramp = np.linspace(0.1, 1.0, PREVIEW + 1)[:, None] * np.ones(2)
     flat = np.tile(ramp[0], (PREVIEW + 1, 1))
-    J, look = np.ones((2, 3)) + np.eye(2, 3), seen(np.zeros(3), np.zeros(2))
+    J = np.ones((2, 3)) + np.eye(2, 3)
+    look = seen(np.zeros(3), np.zeros(2))
     on = [law(network()).command(Estimate(J), look, reference) for reference in (ramp, flat)]
     off = [
         without_preview().command(Estimate(J), look, reference) for reference in (ramp, flat[:1])
@@ -221,9 +223,13 @@ def test_the_preview_is_used_only_where_it_is_switched_on():
 
 
 def test_the_roll_out_follows_the_reference_from_step_to_step():
-    net, rng = network(), np.random.default_rng(4)
-    reference, q, y = rng.normal(size=(PREVIEW + 1, 2)), rng.normal(size=3), rng.normal(size=2)
-    made, J = law(net, horizon=4), rng.normal(size=(2, 3))
+    net = network()
+    rng = np.random.default_rng(4)
+    reference = rng.normal(size=(PREVIEW + 1, 2))
+    q = rng.normal(size=3)
+    y = rng.normal(size=2)
+    made = law(net, horizon=4)
+    J = rng.normal(size=(2, 3))
     made.command(Estimate(J), seen(q, y), reference)
     history = (reference[:1] - y, q[None])
     ahead = roll_out(net, net.weights, J, history, np.diff(reference[:5], axis=0), np.full(3, 1e6))
@@ -280,11 +286,11 @@ def test_every_update_removes_its_part_of_what_the_updates_of_one_step_remove():
 def test_what_is_seen_at_another_rate_asks_for_the_same_velocity(error_history, position_history):
     # Feature, joints and reference move evenly. Without learning every rate has the same ξ and the same command, and
     # the commanded position may stand in for the measured one.
-    net, J = (
-        network(error_history=error_history, position_history=position_history),
-        np.ones((2, 3)) + np.eye(2, 3),
-    )
-    velocity, commands, predicted = np.array([0.3, -0.2, 0.1]), [], []
+    net = network(error_history=error_history, position_history=position_history)
+    J = np.ones((2, 3)) + np.eye(2, 3)
+    velocity = np.array([0.3, -0.2, 0.1])
+    commands = []
+    predicted = []
     for rate, position in product((PERIOD, 0.1, 0.02, 0.004), ("measured", "commanded")):
         made, rows = at_rate(rate, net, k=1e-9, position=position)
         ahead = 0.5 + np.outer(np.arange(rows) * rate, [0.2, 0.4])
@@ -300,7 +306,9 @@ def test_what_is_seen_at_another_rate_asks_for_the_same_velocity(error_history, 
 
 
 def test_learning_per_second_does_not_depend_on_the_rate():
-    net, J, look = network(), np.ones((2, 3)) + np.eye(2, 3), seen(np.full(3, 0.5), np.zeros(2))
+    net = network()
+    J = np.ones((2, 3)) + np.eye(2, 3)
+    look = seen(np.full(3, 0.5), np.zeros(2))
     learned = []
     for rate in (0.01, 0.005, 0.0025):
         made, rows = at_rate(rate, net, k=0.1)

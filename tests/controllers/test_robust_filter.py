@@ -23,7 +23,9 @@ from servobench.harness.run.episode import carry_out_together
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 
-M, N, NOISE = 3, 4, 0.001
+M = 3
+N = 4
+NOISE = 0.001
 
 
 def frames(count, share, size=0.2, frames_each=1, seed=0):
@@ -63,7 +65,8 @@ def test_a_filter_without_weights_is_the_kalman_filter_of_feature_and_jacobian()
     for k in range(1, 30):
         before = run.state
         run.update(motion(dq[k], y[k] - y[k - 1]))
-        F, Q = np.eye(N + 1), config.walk**2 * 0.05 * np.eye(N + 1)
+        F = np.eye(N + 1)
+        Q = config.walk**2 * 0.05 * np.eye(N + 1)
         F[0, 1:] = dq[k]
         Q[0, 0] = (config.motion_error * np.linalg.norm(x[:, 1:] @ dq[k])) ** 2
         for i in range(M):
@@ -87,7 +90,9 @@ def test_the_weight_is_that_of_tukey_and_belongs_to_the_residual():
     np.testing.assert_allclose(
         bisquare_weight(u), [1.0, (1.0 - 1.0 / BISQUARE**2) ** 2, 0.25, 0.0, 0.0], atol=1e-15
     )
-    innovation, variance, noise = np.array([0.002]), np.array([1e-6]), np.array([4e-6])
+    innovation = np.array([0.002])
+    variance = np.array([1e-6])
+    noise = np.array([4e-6])
     w = irls_weight(innovation, variance, noise)
     residual = innovation * noise / (w * variance + noise)
     np.testing.assert_allclose(bisquare_weight(residual / np.sqrt(noise)), w, atol=1e-6)

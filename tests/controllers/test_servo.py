@@ -39,7 +39,8 @@ def servo(estimator, law=None, aids=None, knowledge=KNOWLEDGE, **initial):
 
 def test_a_motion_spans_the_gap_that_lost_frames_leave():
     estimator = Recorder()
-    controller, reference = servo(estimator), np.full((2, 2), 0.3)
+    controller = servo(estimator)
+    reference = np.full((2, 2), 0.3)
     first = seen([0.0, 0.0, 0.0], [0.1, 0.1])
     controller.reset(first, 0)
     controller.step(first, reference)
@@ -58,7 +59,8 @@ def test_a_motion_spans_the_gap_that_lost_frames_leave():
 
 def test_nothing_is_learnt_before_a_second_valid_feature():
     estimator = Recorder()
-    controller, reference = servo(estimator), np.zeros((2, 2))
+    controller = servo(estimator)
+    reference = np.zeros((2, 2))
     first = seen(np.zeros(3), np.zeros(2), valid=False)
     controller.reset(first, 0)
     assert controller.estimated_jacobian() is None
@@ -70,14 +72,16 @@ def test_nothing_is_learnt_before_a_second_valid_feature():
 
 
 def test_a_command_that_is_not_finite_is_a_named_fault():
-    controller, first = servo(ConstantEstimator(), Broken()), seen(np.zeros(3), np.zeros(2))
+    controller = servo(ConstantEstimator(), Broken())
+    first = seen(np.zeros(3), np.zeros(2))
     controller.reset(first, 0)
     with pytest.raises(ControllerDiverged, match="joint_velocity is not finite at 0 s"):
         controller.step(first, np.zeros((2, 2)))
 
 
 def test_an_estimate_that_is_not_finite_is_a_named_fault():
-    estimator, first = Recorder(), seen(np.zeros(3), np.zeros(2))
+    estimator = Recorder()
+    first = seen(np.zeros(3), np.zeros(2))
     controller = servo(estimator)
     controller.reset(first, 0)
     controller.step(first, np.zeros((2, 2)))
@@ -127,10 +131,8 @@ def test_the_law_gets_the_feature_and_the_reference_of_when_commands_are_carried
 
 def test_the_last_stages_change_what_is_sent_and_the_law_notes_it():
     aids = {"feedforward": True, "limit": "clip"}
-    controller, reference = (
-        servo(ConstantEstimator(), Wishing(), aids),
-        np.array([[0.0, 0.0], [0.02, 0.01]]),
-    )
+    controller = servo(ConstantEstimator(), Wishing(), aids)
+    reference = np.array([[0.0, 0.0], [0.02, 0.01]])
     controller.reset(seen(np.zeros(3), np.zeros(2)), 0)
     u = controller.step(seen(np.zeros(3), np.zeros(2)), reference).joint_velocity
     wanted = (
@@ -153,11 +155,9 @@ def test_a_law_of_the_model_works_in_the_frame_of_the_model():
 
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     for law, frame in ((Trained(), np.eye(2)), (Wishing(), turn)):
-        controller, rng, q = (
-            servo(ConstantEstimator(), law, {"model": "regression"}),
-            np.random.default_rng(0),
-            0.0,
-        )
+        controller = servo(ConstantEstimator(), law, {"model": "regression"})
+        rng = np.random.default_rng(0)
+        q = 0.0
         for k in range(40):
             q = q + 0.05 * rng.normal(size=3)
             y = turn @ J0 @ q
@@ -175,11 +175,9 @@ def test_a_law_of_the_model_works_in_the_frame_of_the_model():
 def test_the_stages_start_where_the_probing_ends():
     probing = {"source": "probe", "probe_step": 0.01, "settle_time": 0.05, "average_time": 0.05}
     knowledge = dataclasses.replace(KNOWLEDGE, preview=1)
-    controller, q, reference = (
-        servo(ConstantEstimator(), None, EQUIPPED, knowledge, **probing),
-        np.zeros(3),
-        np.zeros((2, 2)),
-    )
+    controller = servo(ConstantEstimator(), None, EQUIPPED, knowledge, **probing)
+    q = np.zeros(3)
+    reference = np.zeros((2, 2))
     controller.reset(seen(q, J0 @ q), 0)
     for k in range(40):
         u = controller.step(seen(q, J0 @ q, k=k), reference).joint_velocity

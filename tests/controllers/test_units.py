@@ -19,17 +19,15 @@ def knowledge(scale, **more):
 
 def test_everything_about_features_is_divided_by_their_scale():
     J = np.array([[160.0, 0.0], [32.0, 8.0]])
-    natural = in_natural_units(
-        knowledge(
-            16.0,
-            nominal_jacobian=lambda q: np.broadcast_to(J, (*q.shape[:-1], 2, 2)),
-            true_jacobian=lambda q: 2.0 * J,
-            true_symbolic=lambda q: 48.0 * q,
-        )
+    given = knowledge(
+        16.0,
+        nominal_jacobian=lambda q: np.broadcast_to(J, (*q.shape[:-1], 2, 2)),
+        true_jacobian=lambda q: 2.0 * J,
+        true_symbolic=lambda q: 48.0 * q,
     )
-    np.testing.assert_array_equal(
-        natural.nominal_jacobian(np.zeros((3, 2)))[2], [[10.0, 0.0], [2.0, 0.5]]
-    )
+    natural = in_natural_units(given)
+    nominal = natural.nominal_jacobian(np.zeros((3, 2)))
+    np.testing.assert_array_equal(nominal[2], [[10.0, 0.0], [2.0, 0.5]])
     np.testing.assert_array_equal(natural.true_jacobian(np.zeros(2)), [[20.0, 0.0], [4.0, 1.0]])
     assert natural.true_symbolic(2.0) == 6.0
     assert natural.unit == 16.0
