@@ -38,12 +38,10 @@ from servobench.plant.contract.faults import ConfigurationError
 
 CONFIDENCE: Final = 0.95
 ALPHA: Final = 0.05  # of each one-sided test
-MIN_PAIRS: Final = (
-    6  # least number of equal signs that a two-sided sign test distinguishes from chance at 5 %
-)
-LOST_MARGIN: Final = (
-    0.03  # difference in the share of lost runs up to which methods may be equivalent
-)
+# The least number of equal signs that a two-sided sign test distinguishes from chance at 5 %
+MIN_PAIRS: Final = 6
+# The difference in the share of lost runs up to which methods may be equivalent
+LOST_MARGIN: Final = 0.03  # [1]
 Verdict = Literal["better", "equivalent", "worse", "undecided"]
 RESAMPLES: Final = 2000
 DRAWN_AT_ONCE: Final = 1_000_000  # values of resamples in memory; the same are drawn for any number
@@ -54,8 +52,9 @@ def number(value: float, spec: str) -> str:
     """Return a number formatted with `spec` as a reader wants it: ∞ for infinity, – for no number, never -0."""
     if np.isnan(value):
         return MISSING
-    sign, rest = (spec[0], spec[1:]) if spec[:1] in {"+", "-", " "} else ("", spec)
-    return format(value, f"{sign}z{rest}").replace("inf", "∞")
+    sign = spec[0] if spec[:1] in {"+", "-", " "} else ""
+    without_minus_zero = f"{sign}z{spec.removeprefix(sign)}"
+    return format(value, without_minus_zero).replace("inf", "∞")
 
 
 @dataclass(frozen=True)
@@ -106,25 +105,31 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
         second: likewise, of the same robots.
         margin: difference that does not matter.
     """
-    one, other = _sample(first), _sample(second)
+    one = _sample(first)
+    other = _sample(second)
     with np.errstate(invalid="ignore"):
         difference = np.round(one - other, 12)  # ±∞ where one is lost, NaN where both are
-    count, sign = len(difference), np.where(np.isnan(difference), 0.0, np.sign(difference))
+    count = len(difference)
     mean = mean_with_interval(difference[np.isfinite(difference)])
-    more, fewer = (
-        int(np.count_nonzero(each)) for each in (difference == np.inf, difference == -np.inf)
-    )
+    only_first_lost = int(np.count_nonzero(difference == np.inf))
+    only_second_lost = int(np.count_nonzero(difference == -np.inf))
+    lost_alike = abs(only_first_lost - only_second_lost) <= LOST_MARGIN * count
     verdict: Verdict = "undecided"
-    if is_majority(more, fewer) or is_majority(fewer, more):
-        verdict = "worse" if more > fewer else "better"
-    elif mean.count >= MIN_PAIRS and (mean.low > margin or mean.high < -margin):
+    if is_majority(only_first_lost, only_second_lost):
+        verdict = "worse"
+    elif is_majority(only_second_lost, only_first_lost):
+        verdict = "better"
+    elif mean.count < MIN_PAIRS:
+        verdict = "undecided"
+    elif mean.low > margin or mean.high < -margin:
         verdict = "worse" if mean.value > 0.0 else "better"
-    elif mean.count >= MIN_PAIRS and max(-mean.low, mean.high) <= margin:
-        verdict = "equivalent" if abs(more - fewer) <= LOST_MARGIN * count else "undecided"
+    elif max(-mean.low, mean.high) <= margin and lost_alike:
+        verdict = "equivalent"
+    # P(first < second) + P(equal)/2 = 1/2 − E(sign)/2; a robot that both lose counts as equal.
+    sign = np.where(np.isnan(difference), 0.0, np.sign(difference))
+    probability = 0.5 - 0.5 * float(sign.sum()) / max(count, 1)
     lost = int(np.isinf(one).sum()), int(np.isinf(other).sum())
-    return Difference(
-        mean, _wilson(0.5 - 0.5 * float(sign.sum()) / max(count, 1), count), lost, verdict
-    )
+    return Difference(mean, _wilson(probability, count), lost, verdict)
 
 
 def is_majority(ones: int, others: int) -> bool:
@@ -142,10 +147,14 @@ def mean_with_interval(values: FloatArray) -> Estimate:
     from scipy.special import stdtrit  # noqa: PLC0415 - to judge alone
 
     count = len(values)
-    if count < 2:
-        return Estimate(float(values.sum()), np.nan, np.nan, count) if count else NO_ESTIMATE
-    mean, error = float(values.mean()), float(values.std(ddof=1)) / count**0.5
-    reach = float(stdtrit(count - 1, 1.0 - ALPHA)) * error
+    if count == 0:
+        return NO_ESTIMATE
+    if count == 1:
+        return Estimate(float(values.sum()), np.nan, np.nan, count)
+    mean = float(values.mean())
+    standard_error = float(values.std(ddof=1)) / count**0.5
+    quantile = float(stdtrit(count - 1, 1.0 - ALPHA))  # ALPHA at each end
+    reach = quantile * standard_error
     return Estimate(mean, mean - reach, mean + reach, count)
 
 
@@ -178,18 +187,23 @@ def median_with_interval(
         ValueError: no value, or −∞.
     """
     given = np.asarray(values, dtype=np.float64).ravel()
-    sample = _sample(given[~np.isnan(given)] if missing == "left_out" else given)
+    if missing == "left_out":
+        given = given[~np.isnan(given)]
+    sample = _sample(given)
     if len(sample) == 0:
         raise ValueError("values must hold at least one number")
     finite = np.isfinite(sample)
     known = sample[finite] if finite.any() else np.zeros(1)
     largest = float(known.max())
 
+    # Stand-ins above all finite values keep the order; a mean with one of them lies above, too.
+    stand_in = largest + 2.0 * (1.0 + float(np.ptp(known)))
+    sample = np.where(finite, sample, stand_in)
+
     def restored(medians: FloatArray) -> FloatArray:
+        """Return medians with ∞ where a stand-in took part."""
         return np.where(medians > largest, np.inf, medians)
 
-    # Stand-ins above all finite values keep the order; a mean with one of them lies above, too.
-    sample = np.where(finite, sample, largest + 2.0 * (1.0 + float(np.ptp(known))))
     value = float(restored(np.median(sample, keepdims=True))[0])
     if len(sample) == 1:
         return Estimate(value, np.nan, np.nan, 1)
@@ -197,11 +211,15 @@ def median_with_interval(
 
     with np.errstate(under="ignore"):  # scipy also takes a standard error, of numbers however small
         drawn = stats.bootstrap(
-            (sample,), np.median, n_resamples=RESAMPLES, batch=max(1, DRAWN_AT_ONCE // len(sample)),
-            method="percentile", rng=np.random.default_rng(0),
-        ).bootstrap_distribution  # fmt: skip
-    medians = restored(np.sort(drawn))
-    # Order statistics, as nothing lies between a number and infinity
+            (sample,),
+            np.median,
+            n_resamples=RESAMPLES,
+            batch=max(1, DRAWN_AT_ONCE // len(sample)),
+            method="percentile",
+            rng=np.random.default_rng(0),
+        )
+    medians = restored(np.sort(drawn.bootstrap_distribution))
+    # The ends are order statistics, as nothing lies between a number and infinity.
     cut = int((1.0 - CONFIDENCE) / 2.0 * RESAMPLES)
     return Estimate(value, float(medians[cut]), float(medians[-1 - cut]), len(sample))
 
@@ -218,7 +236,7 @@ def tail_mean(values: ArrayLike, level: float = 0.95) -> float:
         raise ValueError("values must hold at least one number")
     if np.isinf(sample[0]):
         return np.inf
-    share = (1.0 - level) * len(sample)
+    share = (1.0 - level) * len(sample)  # a number of values, seldom a whole one
     weight = np.clip(share - np.arange(len(sample)), 0.0, 1.0)
     return float(weight @ sample / weight.sum())
 
@@ -226,7 +244,9 @@ def tail_mean(values: ArrayLike, level: float = 0.95) -> float:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values after Holm's correction for their number."""
     order = np.argsort(p_values)
-    scaled = np.asarray(p_values)[order] * np.arange(len(order), 0, -1)
+    # The k-th smallest of m is multiplied by m − k + 1, and none becomes less than the one before it.
+    factors = np.arange(len(order), 0, -1)
+    scaled = np.asarray(p_values)[order] * factors
     corrected = np.empty(len(order))
     corrected[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
     return [float(value) for value in corrected]
@@ -236,12 +256,14 @@ def _wilson(share: float, count: int) -> Estimate:
     """Return a share with its Wilson interval; of a share with ties as halves it is wider than need be."""
     if count == 0:
         return NO_ESTIMATE
+    # (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n)
     z = NormalDist().inv_cdf((1.0 + CONFIDENCE) / 2.0)
-    centre, reach = (
-        share + z * z / (2.0 * count),
-        z * (share * (1.0 - share) / count + (0.5 * z / count) ** 2) ** 0.5,
-    )
-    low, high = ((centre + side * reach) / (1.0 + z * z / count) for side in (-1.0, 1.0))
+    centre = share + z * z / (2.0 * count)
+    variance = share * (1.0 - share) / count + (0.5 * z / count) ** 2
+    reach = z * variance**0.5
+    scale = 1.0 + z * z / count
+    low = (centre - reach) / scale
+    high = (centre + reach) / scale
     return Estimate(share, max(low, 0.0), min(high, 1.0), count)
 
 
@@ -257,11 +279,14 @@ FROM_TWIN: Final = "drawn from the twin"  # in titles, the mismatch none of such
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
 CONDITION: Final = ("plant", "sensing", "task", "mismatch")  # with the settings that are varied
 HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
-ERROR_MARGIN: Final = 0.04  # of the settling band: 0.2 mm of 5 mm
-BOUND_MARGIN: Final = 0.1  # of the error of a controller that knows the robot
-SHARE_MARGIN: Final = 0.01
+# Differences that do not matter, see `margin`
+ERROR_MARGIN: Final = 0.04  # [1] share of the settling band: 0.2 mm in 5 mm
+BOUND_MARGIN: Final = 0.1  # [1] share of the error of a controller that knows the robot
+SHARE_MARGIN: Final = 0.01  # [1]
 SECOND_LAP: Final = "rms_error_second_lap"
-POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
+POINT_TO_POINT: Final = "point_to_point"
+CURVE: Final = "curve"
+TASK_KINDS: Final = (POINT_TO_POINT, CURVE)
 
 
 def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
@@ -271,17 +296,17 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     found = []
     for key, group in runs.groupby(known, sort=False, dropna=False):
         values: dict[str, Any] = dict(zip(known, key, strict=True))
-        words = f"{values['task']} on {place_name(values['plant'], values.get('sensing'))}, {values['mismatch']}"
-        if (
-            abs(values.get("noise_factor", 1.0) - 1.0) > 0.0
-        ):  # NaN: a row of a table without this column
+        place = place_name(values["plant"], values.get("sensing"))
+        words = f"{values['task']} on {place}, {values['mismatch']}"
+        # The factor is NaN in a row of a table without this column.
+        if abs(values.get("noise_factor", 1.0) - 1.0) > 0.0:
             words += f", noise × {values['noise_factor']:g}"
         for name, (heading, factor) in varied.items():
             if name != "noise_factor" and not pd.isna(values[name]):
                 quantity, _, unit = heading.removesuffix("]").partition(" [")
-                words += (
-                    f", {quantity} {shown_value(values[name], factor)}{f' {unit}' * bool(unit)}"
-                )
+                words += f", {quantity} {shown_value(values[name], factor)}"
+                if unit:
+                    words += f" {unit}"
         found.append((words, group))
     return found
 
@@ -290,16 +315,16 @@ def shown_value(value: Any, factor: float = 1.0, missing: str = "as configured")
     """Return the value of a condition as text: a number times the factor to the unit in which it is shown."""
     if pd.isna(value):
         return missing
-    return f"{factor * value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{factor * value:g}"
+    return str(value)
 
 
 def place_name(plant: Any, sensing: Any) -> str:  # noqa: ANN401 - cells of the table of runs
     """Return a plant's name for a title, with the sensing set-up where it is not the usual one."""
-    return (
-        f"{plant}"
-        if sensing in (None, DEFAULT_SENSING) or pd.isna(sensing)
-        else f"{plant} {sensing}"
-    )
+    if sensing in (None, DEFAULT_SENSING) or pd.isna(sensing):
+        return f"{plant}"
+    return f"{plant} {sensing}"
 
 
 def with_places(runs: pd.DataFrame) -> pd.DataFrame:
@@ -315,20 +340,17 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     A task of which no run could be built has no kind and is in neither.
     """
     kinds = texts_of(runs, "task_kind")
-    moves, curves = (
-        runs[runs["task"].isin(runs.loc[kinds == kind, "task"].unique())] for kind in TASK_KINDS
-    )
-    return moves, curves
+    moves = runs.loc[kinds == POINT_TO_POINT, "task"].unique()
+    curves = runs.loc[kinds == CURVE, "task"].unique()
+    return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
 
 
 def grouped(rows: Any) -> pd.DataFrame:  # noqa: ANN401 - rows, or columns by their names
     """Return a table whose columns are pairs (group, heading)."""
     table = pd.DataFrame(rows)
-    return (
-        table
-        if table.empty
-        else table.set_axis(pd.MultiIndex.from_tuples(map(tuple, table.columns)), axis=1)
-    )
+    if table.empty:
+        return table
+    return table.set_axis(pd.MultiIndex.from_tuples(map(tuple, table.columns)), axis=1)
 
 
 def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
@@ -348,26 +370,27 @@ def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
 
 def settled_share(runs: pd.DataFrame) -> Estimate:
     """Return how many of `runs` settled, in percent, with the Wilson interval."""
-    return success_rate(int(settling_times(runs).notna().sum()), len(runs)).scaled(100.0)
+    settled = int(settling_times(runs).notna().sum())
+    return success_rate(settled, len(runs)).scaled(100.0)
 
 
 def achieved_share(runs: pd.DataFrame) -> Estimate:
     """Return how many of `runs` settled or followed their curve, in percent, with the Wilson interval."""
-    return success_rate(int(outcomes(runs).isin(ACHIEVED).sum()), len(runs)).scaled(100.0)
+    achieved = int(outcomes(runs).isin(ACHIEVED).sum())
+    return success_rate(achieved, len(runs)).scaled(100.0)
 
 
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return the outcome of each run; in a table without it, `not_settled` or `not_followed` give no reason."""
-    curve = texts_of(runs, "task_kind") == CURVE
-    follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(
-        runs, "settling_band"
-    )
+    is_curve = texts_of(runs, "task_kind") == CURVE
+    largest_error = FOLLOWING_BANDS * column_of(runs, "settling_band")
+    follows = column_of(runs, "rms_error_evaluated") <= largest_error
     on_curve = np.where(follows, FOLLOWED, NOT_FOLLOWED)
-    moved = np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED)
-    guessed = pd.Series(np.where(curve, on_curve, moved), index=runs.index)
+    on_move = np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED)
+    guessed = pd.Series(np.where(is_curve, on_curve, on_move), index=runs.index)
     guessed = guessed.where(runs["status"] == COMPLETED, runs["status"])
-    told = texts_of(runs, "outcome").astype(object)
-    return told.where(told.notna(), guessed).rename("outcome").astype(str)
+    stored = texts_of(runs, "outcome").astype(object)
+    return stored.where(stored.notna(), guessed).rename("outcome").astype(str)
 
 
 def achievement(runs: pd.DataFrame) -> str:
@@ -377,7 +400,9 @@ def achievement(runs: pd.DataFrame) -> str:
 
 def handy_unit(feature_unit: str | None) -> tuple[str, float]:
     """Return the unit in which errors of a feature are shown, and the factor to it; None is an unknown unit."""
-    return HANDY_UNITS.get(feature_unit or "", (feature_unit or "feature unit", 1.0))
+    if not feature_unit:
+        return ("feature unit", 1.0)
+    return HANDY_UNITS.get(feature_unit, (feature_unit, 1.0))
 
 
 def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
@@ -386,7 +411,9 @@ def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
     if metric.unit:
         return ("%", 100.0) if metric.percent else (metric.unit, 1.0)
     units = texts_of(runs, "feature_unit").dropna().unique().tolist()
-    return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
+    if len(units) > 1:
+        return (" or ".join(units), 1.0)
+    return handy_unit(units[0] if units else None)
 
 
 def metric_heading(name: str, runs: pd.DataFrame) -> str:
@@ -397,11 +424,11 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
 
 def is_superfluous(name: str, runs: pd.DataFrame) -> bool:
     """Return whether a metric repeats another one: these runs have no second lap, or it is the judged part."""
+    if name != SECOND_LAP:
+        return False
     second = texts_of(runs, name)
-    return (
-        name == SECOND_LAP
-        and (second.isna() | (second == column_of(runs, "rms_error_evaluated"))).all().item()
-    )
+    is_judged_part = second == column_of(runs, "rms_error_evaluated")
+    return (second.isna() | is_judged_part).all().item()
 
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
@@ -411,11 +438,8 @@ def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
         return runs
     handy = [handy_unit(unit if isinstance(unit, str) else None) for unit in units]
     factors = [factor for _, factor in handy]
-    changed = {
-        name: factors * runs[name]
-        for name, metric in METRICS.items()
-        if not metric.unit and name in runs
-    }
+    errors = [name for name, metric in METRICS.items() if not metric.unit and name in runs]
+    changed = {name: factors * runs[name] for name in errors}
     return runs.assign(feature_unit=[unit for unit, _ in handy], **changed)
 
 
@@ -424,9 +448,10 @@ def settling_band(runs: pd.DataFrame, factor: float = 1.0) -> str:
     known = runs.reindex(columns=["settling_band", "feature_unit"]).dropna().drop_duplicates()
     if len(known) != 1:
         return "the settling band" if factor == 1.0 else f"{factor:g} settling bands"
-    (band,), (unit,) = known["settling_band"], known["feature_unit"]
-    name, handy = handy_unit(str(unit))
-    return f"{factor * handy * float(band):.3g} {name}"
+    (band,) = known["settling_band"]
+    (unit,) = known["feature_unit"]
+    name, to_handy = handy_unit(str(unit))
+    return f"{factor * to_handy * float(band):.3g} {name}"
 
 
 def margin(name: str, runs: pd.DataFrame) -> float:
@@ -440,17 +465,12 @@ def margin(name: str, runs: pd.DataFrame) -> float:
         return float(column_of(runs, "period_s").fillna(RunSettings.period).max())
     if unit:
         return SHARE_MARGIN if unit == "1" else 0.0
-    bounds = runs[
-        runs["controller"].isin(
-            [each for each in runs["controller"].unique() if knows_truth(str(each))]
-        )
-    ]
+    names = [each for each in runs["controller"].unique() if knows_truth(str(each))]
+    bounds = runs[runs["controller"].isin(names)]
     best = column_of(bounds, name).groupby(bounds["controller"]).median().min()
-    return float(
-        np.nan_to_num(
-            np.fmax(ERROR_MARGIN * column_of(runs, "settling_band").max(), BOUND_MARGIN * best)
-        )
-    )
+    band = column_of(runs, "settling_band").max()
+    larger = np.fmax(ERROR_MARGIN * band, BOUND_MARGIN * best)  # either may be unknown, NaN
+    return float(np.nan_to_num(larger))
 
 
 def knows_truth(name: str) -> bool:
@@ -485,9 +505,12 @@ def compare_pairs(
 def _paired_values(
     runs: pd.DataFrame, pair: tuple[str, str], metric: str, keys: Sequence[str]
 ) -> tuple[pd.Series[float], pd.Series[float]]:
+    """Return the values of two controllers on the runs that they share, by the keys of these; NaN of lost ones."""
     values = column_of(runs, metric).where(runs["status"] == COMPLETED)
-    indexed = pd.Series(values.to_numpy(), index=pd.MultiIndex.from_frame(runs[list(keys)]))
-    first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
+    index = pd.MultiIndex.from_frame(runs[list(keys)])
+    indexed = pd.Series(values.to_numpy(), index=index)
+    first = indexed[(runs["controller"] == pair[0]).to_numpy()]
+    second = indexed[(runs["controller"] == pair[1]).to_numpy()]
     for name, series in zip(pair, (first, second), strict=True):
         if series.index.has_duplicates:
             raise ConfigurationError(

@@ -14,6 +14,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from numpy.typing import ArrayLike
 
@@ -45,15 +46,15 @@ def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray
     Raises:
         ValueError: a floor that is not above 0.
     """
-    own, reference, floor = np.broadcast_arrays(
-        *(np.asarray(each, np.float64) for each in (own, reference, floor))
-    )
+    arrays = [np.asarray(each, np.float64) for each in (own, reference, floor)]
+    own, reference, floor = np.broadcast_arrays(*arrays)
     if not (floor > 0.0).all():
         raise ValueError(f"floor must be above 0, got {float(np.min(floor))}")
     known = np.where(np.isfinite(own), np.maximum(own, floor), np.inf)
     bound = np.where(np.isfinite(reference), np.maximum(reference, floor), known)
     with np.errstate(invalid="ignore"):  # ∞ / ∞, where both are lost
-        return np.asarray(np.where(np.isinf(known), 0.0, np.minimum(1.0, bound / known)))
+        ratio = np.minimum(1.0, bound / known)
+    return np.asarray(np.where(np.isinf(known), 0.0, ratio))
 
 
 def ranking(table: pd.DataFrame) -> list[Ranked]:
@@ -72,14 +73,19 @@ def ranking(table: pd.DataFrame) -> list[Ranked]:
     by_robot = _by_robot(table, "score")
     means, drawn = _means_with_resamples(by_robot)
     tail = (1.0 - CONFIDENCE) / 2.0
-    ends, apart = drawn.quantile([tail, 1.0 - tail]), _told_apart(means, drawn)
+    ends = drawn.quantile([tail, 1.0 - tail])
+    apart = _told_apart(means, drawn)
     found: list[Ranked] = []
+    rank = 1
+    best = str(means.index[0])  # of those with this rank
     for place, name in enumerate(map(str, means.index), start=1):
+        if frozenset((best, name)) in apart:
+            rank = place
+            best = name
         low, high = map(float, ends[name])
         estimate = Estimate(float(means[name]), low, high, len(by_robot))
-        shared = found and frozenset((found[found[-1].rank - 1].controller, name)) not in apart
-        rank = found[-1].rank if shared else place
-        found.append(Ranked(rank, name, estimate, float((by_robot[name] == 0.0).mean())))
+        lost = float((by_robot[name] == 0.0).mean())
+        found.append(Ranked(rank, name, estimate, lost))
     return found
 
 
@@ -113,23 +119,26 @@ def resolution(table: pd.DataFrame) -> float:
         ValueError: a challenge with fewer than two robots, or as `ranking`.
     """
     by_robot = _by_robot(table, "score")
-    values, generator = by_robot.to_numpy().T, np.random.default_rng(0)
-    challenges, seeds = (
-        by_robot.index.get_level_values(name).to_numpy() for name in ("challenge", "seed")
-    )
-    numbers, count = np.unique(seeds, return_inverse=True)[1], len(np.unique(seeds))
-    rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
+    values = by_robot.to_numpy().T
+    rows = _rows_of_challenges(by_robot)
     if min(map(len, rows)) < 2:
         raise ValueError("a ranking is split into halves: each challenge needs at least two robots")
+    seeds = by_robot.index.get_level_values("seed").to_numpy()
+    robots, robot_of_row = np.unique(seeds, return_inverse=True)
+    generator = np.random.default_rng(0)
     differences = []
     for _ in range(SPLITS):
-        order = generator.permutation(count)[numbers]
-        shuffled = [own[np.argsort(order[own])] for own in rows]
-        halves = zip(
-            *((own[: len(own) // 2], own[len(own) // 2 :]) for own in shuffled), strict=True
-        )
-        first, second = (_middle_means(values[:, np.concatenate(half)]) for half in halves)
-        differences.append(np.abs(first - second))
+        # Robots have one order in all challenges; each challenge is halved where half of its own robots are passed.
+        order = generator.permutation(len(robots))[robot_of_row]
+        first, second = [], []
+        for own in rows:
+            shuffled = own[np.argsort(order[own])]
+            middle = len(own) // 2
+            first.append(shuffled[:middle])
+            second.append(shuffled[middle:])
+        first_means = _middle_means(values[:, np.concatenate(first)])
+        second_means = _middle_means(values[:, np.concatenate(second)])
+        differences.append(np.abs(first_means - second_means))
     return float(np.median(differences))
 
 
@@ -142,55 +151,61 @@ def _by_robot(table: pd.DataFrame, column: str, *, lost: bool = False) -> pd.Dat
         challenge, seed, name = table.loc[again, keys].iloc[0]
         raise ValueError(f"{name} has several runs of challenge {challenge}, seed {seed}: keep one")
     known = table.set_index(keys)[column].astype(float)
-    filled = (known.fillna(np.inf) if lost else known).unstack("controller", sort=False)
-    if len(missing := np.argwhere(filled.isna().to_numpy())):
-        (challenge, seed), name = filled.index[missing[0, 0]], filled.columns[missing[0, 1]]
+    if lost:
+        known = known.fillna(np.inf)  # so that only runs that do not exist are NaN
+    filled = known.unstack("controller", sort=False)
+    missing = np.argwhere(filled.isna().to_numpy())
+    if len(missing):
+        row, place = missing[0]
+        challenge, seed = filled.index[row]
+        name = filled.columns[place]
         raise ValueError(
             f"{name} lacks the {column} of challenge {challenge}, seed {seed}: methods need the same runs"
         )
     return filled.where(filled != np.inf) if lost else filled
 
 
+def _rows_of_challenges(by_robot: pd.DataFrame) -> list[npt.NDArray[np.intp]]:
+    """Return the numbers of the rows of each challenge."""
+    challenges = by_robot.index.get_level_values("challenge").to_numpy()
+    return [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
+
+
 def _middle_means(values: FloatArray) -> FloatArray:
     """Return the interquartile mean over the last axis."""
-    cut, count = int(TRIMMED * values.shape[-1]), values.shape[-1]
-    return np.asarray(
-        np.partition(values, (cut, count - cut - 1))[..., cut : count - cut].mean(axis=-1)
-    )
+    count = values.shape[-1]
+    cut = int(TRIMMED * count)
+    parted = np.partition(values, (cut, count - cut - 1))
+    return np.asarray(parted[..., cut : count - cut].mean(axis=-1))
 
 
 def _means_with_resamples(by_robot: pd.DataFrame) -> tuple[pd.Series[float], pd.DataFrame]:
     """Return the interquartile mean of each method, best first, and those of resamples of the robots."""
-    values, generator = np.ascontiguousarray(by_robot.to_numpy().T), np.random.default_rng(0)
-    challenges = by_robot.index.get_level_values("challenge").to_numpy()
-    rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
-    samples = (
-        np.concatenate([generator.choice(own, len(own)) for own in rows]) for _ in range(RESAMPLES)
-    )
-    drawn = [_middle_means(values[:, sample]) for sample in samples]
-    means = pd.Series(_middle_means(values), index=by_robot.columns).sort_values(
-        ascending=False, kind="stable"
-    )
-    return means, pd.DataFrame(drawn, columns=by_robot.columns)
+    values = np.ascontiguousarray(by_robot.to_numpy().T)
+    rows = _rows_of_challenges(by_robot)
+    generator = np.random.default_rng(0)
+    drawn = []
+    for _ in range(RESAMPLES):
+        sample = np.concatenate([generator.choice(own, len(own)) for own in rows])
+        drawn.append(_middle_means(values[:, sample]))
+    means = pd.Series(_middle_means(values), index=by_robot.columns)
+    best_first = means.sort_values(ascending=False, kind="stable")
+    return best_first, pd.DataFrame(drawn, columns=by_robot.columns)
 
 
 def _told_apart(means: pd.Series[float], drawn: pd.DataFrame) -> set[frozenset[str]]:
+    """Return the pairs of methods whose means differ significantly, see `ranking`."""
     from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
 
     pairs = list(combinations(map(str, means.index), 2))
     p_values = []
     for first, second in pairs:
-        deviation, difference = (
-            float((drawn[first] - drawn[second]).std()),
-            abs(means[first] - means[second]),
-        )
-        certain = 0.0 if difference > 0.0 else 1.0
-        with np.errstate(under="ignore"):
-            p_values.append(
-                2.0 * float(stats.norm.sf(difference / deviation)) if deviation > 0.0 else certain
-            )
-    return {
-        frozenset(pair)
-        for pair, p_value in zip(pairs, holm(p_values), strict=True)
-        if p_value < ALPHA
-    }
+        deviation = float((drawn[first] - drawn[second]).std())
+        difference = abs(means[first] - means[second])
+        if deviation > 0.0:
+            with np.errstate(under="ignore"):
+                p_values.append(2.0 * float(stats.norm.sf(difference / deviation)))
+        else:  # the difference is the same in all resamples
+            p_values.append(0.0 if difference > 0.0 else 1.0)
+    corrected = zip(pairs, holm(p_values), strict=True)
+    return {frozenset(pair) for pair, p_value in corrected if p_value < ALPHA}

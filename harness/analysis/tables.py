@@ -98,17 +98,26 @@ class Cell:
     def __str__(self) -> str:
         """Return it as a reader gets it."""
         text = format(self.value, self.spec)
-        return text.replace("inf", "∞") if isinstance(self.value, float) else text
+        if isinstance(self.value, float):
+            return text.replace("inf", "∞")
+        return text
 
     def plain(self) -> object:
         """Return it as JSON can have it: an estimate with its ends, None for no number, "inf" for infinity."""
         if isinstance(self.value, Estimate):
             return {name: _plain(number) for name, number in asdict(self.value).items()}
-        return self.value if isinstance(self.value, str) else _plain(self.value)
+        if isinstance(self.value, str):
+            return self.value
+        return _plain(self.value)
 
 
 def _plain(number: float) -> object:
-    return None if math.isnan(number) else number if math.isfinite(number) else str(float(number))
+    """Return a number as JSON can have it: None for no number, "inf" for infinity."""
+    if math.isnan(number):
+        return None
+    if math.isinf(number):
+        return str(float(number))
+    return number
 
 
 def as_text(rows: list[Row]) -> pd.DataFrame:
@@ -139,24 +148,27 @@ def statistics_rows(
 
 
 def _controller_rows(runs: pd.DataFrame) -> list[Row]:
+    """Return how each controller of a place does: good runs, medians, the worst runs and the failures."""
     heading = {name: metric_heading(name, runs) for name in METRICS}
-    judged = "rms_error_evaluated" if achievement(runs) == FOLLOWED else "steady_state_error"
-    factor = shown_unit(judged, runs)[1]
+    is_curve = achievement(runs) == FOLLOWED
+    judged = "rms_error_evaluated" if is_curve else "steady_state_error"
+    unit_of_error = heading[judged].rpartition(" ")[2]
+    _, factor = shown_unit(judged, runs)
     rows = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
+        failures = ", ".join(f"{count} {kind}" for kind, count in failed.items())
         error = factor * column_of(own, judged).where(own["status"] == COMPLETED)
         row = {"controller": Cell(str(name)), "runs": Cell(len(own))}
         row[f"{achievement(runs)} [%]"] = Cell(achieved_share(own), ".1f")
-        if judged == "steady_state_error":
+        if not is_curve:
+            overshoot = 100.0 * column_of(own, "overshoot")
             row[heading["settling_time_s"]] = Cell(_median(settling_times(own)), ".2f")
-            row[heading["overshoot"]] = Cell(_median(100.0 * column_of(own, "overshoot")), ".1f")
+            row[heading["overshoot"]] = Cell(_median(overshoot), ".1f")
         row[heading[judged]] = Cell(_median(error), ".1f")
-        row[f"its worst 5 % {heading[judged].rpartition(' ')[2]}"] = Cell(tail_mean(error), ".1f")
-        row["failures"] = Cell(
-            ", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none"
-        )
+        row[f"its worst 5 % {unit_of_error}"] = Cell(tail_mean(error), ".1f")
+        row["failures"] = Cell(failures or "none")
         rows.append(row)
     return rows
 
@@ -172,7 +184,8 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
             f"no two controllers have runs of one seed to compare; leave --metric {metric} out"
         )
     judged = judged_metric(runs)
-    metric = judged if metric is None else metric
+    if metric is None:
+        metric = judged
     filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
     numbers = {judged, *map(str, filled)} & set(runs) - {"seed"}
     if metric not in numbers:
@@ -180,22 +193,29 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
             f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}"
         )
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
-    unit, factor = shown_unit(metric, runs) if metric in METRICS else ("1", 1.0)
-    heading = metric_heading(metric, runs) if metric in METRICS else metric.replace("_", " ")
-    words = (
-        {} if metric in METRICS and METRICS[metric].better else {"better": "less", "worse": "more"}
-    )
-    return [
-        {
+    unit, factor = "1", 1.0  # a column that is no metric
+    heading = metric.replace("_", " ")
+    words = {"better": "less", "worse": "more"}  # nobody knows whether less of it is better
+    if metric in METRICS:
+        unit, factor = shown_unit(metric, runs)
+        heading = metric_heading(metric, runs)
+        if METRICS[metric].better:
+            words = {}
+    better = words.get("better", "better")
+    small = f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")
+    rows = []
+    for (first, second), each in zip(pairs, compared, strict=True):
+        lost_first, lost_second = each.lost
+        row = {
             PAIR: Cell(f"{first} − {second}"),
-            "runs lost": Cell("{} : {}".format(*each.lost)),
+            "runs lost": Cell(f"{lost_first} : {lost_second}"),
             f"mean difference in {heading}": Cell(each.mean.scaled(factor), ".2f"),
             "verdict": Cell(words.get(each.verdict, each.verdict)),
-            f"P(A {words.get('better', 'better')})": Cell(each.probability, ".2f"),
-            "margin": Cell(f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")),
+            f"P(A {better})": Cell(each.probability, ".2f"),
+            "margin": Cell(small),
         }
-        for (first, second), each in zip(pairs, compared, strict=True)
-    ]
+        rows.append(row)
+    return rows
 
 
 def _median(values: pd.Series[float]) -> Estimate:
@@ -205,25 +225,30 @@ def _median(values: pd.Series[float]) -> Estimate:
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
     """Return the meaning of the good outcomes that these runs can have, a line each; the table of runs has parts."""
-    known = pd.concat(
-        [part.reindex(columns=[*BAND, "task_kind"]).drop_duplicates() for part in parts]
-    )
-    lines = {
-        POINT_TO_POINT: f"{SETTLED}: came within {settling_band(known)} and stayed",
-        CURVE: f"{FOLLOWED}: {METRICS['rms_error_evaluated'].label} at most {settling_band(known, FOLLOWING_BANDS)}",
-    }
-    return "\n".join(line for kind, line in lines.items() if (known["task_kind"] == kind).any())
+    columns = [*BAND, "task_kind"]
+    known = pd.concat([part.reindex(columns=columns).drop_duplicates() for part in parts])
+    kinds = set(known["task_kind"])
+    lines = []
+    if POINT_TO_POINT in kinds:
+        lines.append(f"{SETTLED}: came within {settling_band(known)} and stayed")
+    if CURVE in kinds:
+        label = METRICS["rms_error_evaluated"].label
+        lines.append(f"{FOLLOWED}: {label} at most {settling_band(known, FOLLOWING_BANDS)}")
+    return "\n".join(lines)
 
 
 def summary_legend(runs: pd.DataFrame) -> str:
     """Return the meaning of the words in `summary_tables`, a line each."""
+    _, curves = split_tasks(runs)
     lines = [
         outcome_legend([runs]),
-        _judged_parts(split_tasks(runs)[1]["task"].unique()),
+        _judged_parts(curves["task"].unique()),
         "sign switches: large joint commands of opposite sign within two periods",
-        "numbers: medians over runs" * (len(runs) > 1),
-        f"{LATE} some steps took longer than the period" * _is_late(runs),
     ]
+    if len(runs) > 1:
+        lines.append("numbers: medians over runs")
+    if _is_late(runs):
+        lines.append(f"{LATE} some steps took longer than the period")
     return "\n".join(filter(None, lines))
 
 
@@ -246,20 +271,19 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
             (column, metric.summary)
             for wanted in (kind, None)  # measures of such tasks first
             for column, metric in METRICS.items()
-            if metric.summary
-            and metric.summary.kind == wanted
-            and not is_superfluous(column, place)
+            if metric.summary and metric.summary.kind == wanted
+            if not is_superfluous(column, place)
         ]
         rows = []
         for name, own in place.groupby("controller", sort=False):
             row = {"controller": str(name), "outcome": _shares(own)}
             for column, summary in summaries:
                 heading = metric_heading(column, place)
+                _, factor = shown_unit(column, place)
+                values = column_of(own, column)
                 if column == "settling_time_s":
-                    times = settling_times(own)
-                    middle = times.fillna(math.inf).median() if times.notna().any() else math.nan
-                else:
-                    middle = shown_unit(column, place)[1] * column_of(own, column).median()
+                    values = _ends_of_settling(own)
+                middle = factor * values.median()
                 row[heading] = number(middle, f".{summary.digits}f")
                 if column == STEP_TIME and _is_late(own):
                     row[heading] += LATE
@@ -270,11 +294,17 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
 def _shares(runs: pd.DataFrame) -> str:
     """Return the outcome that all runs have, or a line for each outcome with its share."""
     shares = 100.0 * outcomes(runs).value_counts(normalize=True)
-    return (
-        shares.index[0]
-        if len(shares) == 1
-        else "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
-    )
+    if len(shares) == 1:
+        return str(shares.index[0])
+    return "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
+
+
+def _ends_of_settling(runs: pd.DataFrame) -> pd.Series[float]:
+    """Return settling times, s, with ∞ for runs that never settled; NaN throughout where none did."""
+    times = settling_times(runs)
+    if times.isna().all():
+        return times
+    return times.fillna(math.inf)
 
 
 def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
@@ -284,42 +314,48 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     are others, the share of each outcome over all conditions. Of each part of the table of runs only numbers of runs
     are kept.
     """
-    counted, curves = [], set[str]()
+    counted = []
+    curves: set[str] = set()
     for part in parts:
         counted.append(_count_outcomes(part))
-        curves |= set(split_tasks(part)[1]["task"])
-    keys = list(counted[0].columns[:-2])
-    counts = (
-        pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
-    )
+        _, followed = split_tasks(part)
+        curves |= set(followed["task"])
+    keys = list(counted[0].columns[:-2])  # plant, task, conditions, controller
+    same = pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)
+    counts = same[["runs"]].sum()
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
         sums = place.assign(good=good).groupby(keys[2:], sort=False)[["good", "runs"]].sum()
-        table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(number, spec=".1f")
-        table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
-        word = FOLLOWED if task in curves else SETTLED
+        percent = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False)
+        table = percent.map(number, spec=".1f")
+        most_runs = sums["runs"].unstack(sort=False).max(axis=1)
+        table["runs"] = most_runs.map("{:.0f}".format)
         shares = table.rename_axis(columns=None).reset_index()
-        if (shares[SHORT_NAMES["period"].heading] == MISSING).all():
-            del shares[SHORT_NAMES["period"].heading]
+        period = SHORT_NAMES["period"].heading
+        if (shares[period] == MISSING).all():
+            del shares[period]
+        word = FOLLOWED if task in curves else SETTLED
         yield f"{task} on {plant}: {word} [%]", shares
         if good.sum() < place["runs"].sum():
-            kinds = place.pivot_table(
-                values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False
-            )
-            table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(number, spec=".1f")
-            yield (
-                f"{task} on {plant}: outcomes of the runs [%]",
-                table.rename_axis(columns=None).reset_index(),
-            )
+            yield f"{task} on {plant}: outcomes of the runs [%]", _outcome_shares(place)
+
+
+def _outcome_shares(counts: pd.DataFrame) -> pd.DataFrame:
+    """Return the shares of outcomes in percent, a row for each controller, from numbers of runs."""
+    kinds = counts.pivot_table(
+        values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False
+    )
+    shares = 100.0 * kinds.div(kinds.sum(axis=1), axis=0)
+    return shares.map(number, spec=".1f").rename_axis(columns=None).reset_index()
 
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     """Return how many runs of each condition had which outcome: plant, task, conditions, controller, outcome, runs."""
+    texts = {}
     varied = varied_columns([*SWEEP_COLUMNS, *runs.columns])
-    texts = {
-        heading: [shown_value(value, factor, MISSING) for value in texts_of(runs, column)]
-        for column, (heading, factor) in varied.items()
-    }
+    for column, (heading, factor) in varied.items():
+        values = texts_of(runs, column)
+        texts[heading] = [shown_value(value, factor, MISSING) for value in values]
     keys = ["plant", "task", "mismatch", *texts, "controller", "outcome"]
     named = with_places(runs).assign(outcome=outcomes(runs), **texts)
     return named.groupby(keys, sort=False).size().rename("runs").reset_index()
@@ -356,38 +392,39 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
     Where there are many conditions, a group is a task with all its conditions; medians are over all its runs then, and
     have no interval, as runs of one seed in several conditions are no independent ones.
     """
-    places, interval = split_conditions(runs), True
-    if len(places) > MOST_PLACES:
-        pooled = runs.groupby(["task", "feature_unit"], sort=False, dropna=False)
-        units = runs["feature_unit"].nunique(dropna=False) > 1
-        places = [
-            (f"{task}, features in {unit}" if units else str(task), own)
-            for (task, unit), own in pooled
-        ]
-        interval = False
+    places = split_conditions(runs)
+    is_pooled = len(places) > MOST_PLACES
+    if is_pooled:
+        places = _pooled_conditions(runs)
     single = runs["plant"].nunique() * runs["mismatch"].nunique() == 1
     rows = []
     for name in ordered(runs["controller"]):
         row: PageRow = {(WHICH, "controller"): name}
         for words, place in places:
-            own = place[place["controller"] == name]
-            where = (
-                str(place["task"].iloc[0])
-                if single and place["task"].nunique() == 1 and len(places) > 1
-                else words
-            )
-            row[where, f"{achievement(place)} [%]"] = (
-                f"{achieved_share(own):.0f}" if len(own) else MISSING
-            )
+            where = words
+            if single and place["task"].nunique() == 1 and len(places) > 1:
+                where = str(place["task"].iloc[0])
+            is_own = place["controller"] == name
+            share = achieved_share(place[is_own]) if is_own.any() else NO_ESTIMATE
+            row[where, f"{achievement(place)} [%]"] = f"{share:.0f}"
             metric = judged_metric(place)
-            values = judged_column(place)[place["controller"] == name]
+            values = judged_column(place)[is_own]
             middle = median_with_interval(values) if len(values) else NO_ESTIMATE
-            middle = (
-                middle if interval else Estimate(middle.value, math.nan, math.nan, middle.count)
-            )
+            if is_pooled:
+                middle = Estimate(middle.value, math.nan, math.nan, middle.count)
             row[where, metric_heading(metric, place)] = f"{middle:.{METRICS[metric].digits}f}"
         rows.append(row)
     return grouped(rows)
+
+
+def _pooled_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Return the runs of each task over all conditions, with words for it; runs in other units are apart."""
+    several_units = runs["feature_unit"].nunique(dropna=False) > 1
+    places = []
+    for (task, unit), own in runs.groupby(["task", "feature_unit"], sort=False, dropna=False):
+        words = f"{task}, features in {unit}" if several_units else str(task)
+        places.append((words, own))
+    return places
 
 
 def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
@@ -405,10 +442,12 @@ def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
     rows = _rows(runs.assign(outcome=outcomes(runs)), [*_varied(runs), "task"])
     mixed = [(row, own) for row, own in rows if not own["outcome"].isin(ACHIEVED).all()]
     found = {str(word) for _, own in mixed for word in own["outcome"]}
+    faults = sorted(found - set(OUTCOMES))
+    words = [*(word for word in OUTCOMES if word in found), *faults]
     table = []
     for row, own in mixed:
         row[WHICH, "runs"] = str(len(own))
-        for word in [*(word for word in OUTCOMES if word in found), *sorted(found - set(OUTCOMES))]:
+        for word in words:
             count = int((own["outcome"] == word).sum())
             share = success_rate(count, len(own)).scaled(100.0)
             row[_kind_of(word), f"{word} [%]"] = f"{share:.0f}" if count else MISSING
@@ -424,7 +463,8 @@ def meanings(table: pd.DataFrame) -> dict[str, str]:
 
 def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return computing times, as far as known, and use of the joints for each plant and controller."""
-    return _table(runs, "cost", ["plant"] if runs["plant"].nunique() > 1 else [], counted=False)
+    keys = ["plant"] if runs["plant"].nunique() > 1 else []
+    return _table(runs, "cost", keys, counted=False)
 
 
 def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -434,17 +474,17 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
     for (controller, plant, status), own in failed.groupby(
         ["controller", "plant", "status"], sort=False
     ):
-        total = ((runs["controller"] == controller) & (runs["plant"] == plant)).sum()
+        is_same = (runs["controller"] == controller) & (runs["plant"] == plant)
         first = own.iloc[0]
-        which = {
-            "controller": controller,
-            "plant": plant,
-            "ended by": status,
-            "runs": f"{len(own)} of {total}",
+        row: PageRow = {
+            (WHICH, "controller"): str(controller),
+            (WHICH, "plant"): str(plant),
+            (WHICH, "ended by"): str(status),
+            (WHICH, "runs"): f"{len(own)} of {is_same.sum()}",
+            ("The first of them", "run"): str(first["run_id"]),
+            ("The first of them", "reason"): str(first.get("reason") or MISSING),
         }
-        example = {"run": first["run_id"], "reason": first.get("reason") or MISSING}
-        rows.append({(WHICH, name): str(text) for name, text in which.items()}
-                    | {("The first of them", name): str(text) for name, text in example.items()})  # fmt: skip
+        rows.append(row)
     return grouped(rows)
 
 
@@ -488,23 +528,28 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
     rows = []
     columns = [(group, metric_heading(name, runs), name) for group, name in _columns(kind, runs)]
     for row, own in _rows(runs, keys):
+        share = achieved_share(own)
         if counted:
             row["Runs", "number"] = str(len(own))
-            row["Runs", f"{achievement(runs)} [%]"] = f"{achieved_share(own):.0f}"
+            row["Runs", f"{achievement(runs)} [%]"] = f"{share:.0f}"
         else:
-            row["Runs", "lost [%]"] = f"{100.0 - achieved_share(own).value:.0f}"
+            row["Runs", "lost [%]"] = f"{100.0 - share.value:.0f}"
         for group, heading, name in columns:
-            row[group, heading] = (
-                f"{_median_of(own, name, shown_unit(name, runs)[1]):.{METRICS[name].digits}f}"
-            )
+            _, factor = shown_unit(name, runs)
+            middle = _median_of(own, name, factor)
+            row[group, heading] = f"{middle:.{METRICS[name].digits}f}"
         rows.append(row)
     return grouped(rows)
 
 
 def _rows(runs: pd.DataFrame, keys: Sequence[str]) -> Iterator[tuple[PageRow, pd.DataFrame]]:
     """Yield the runs of each condition and controller with the cells that say which they are."""
-    names, headings = ordered(runs["controller"]), varied_columns(runs.columns)
-    for key, place in runs.groupby(list(keys), sort=False, dropna=False) if keys else [((), runs)]:
+    names = ordered(runs["controller"])
+    headings = varied_columns(runs.columns)
+    places: Iterable[tuple[Any, pd.DataFrame]] = [((), runs)]
+    if keys:
+        places = runs.groupby(list(keys), sort=False, dropna=False)
+    for key, place in places:
         for name in names:
             own = place[place["controller"] == name]
             if len(own):
@@ -538,10 +583,13 @@ def _median_of(own: pd.DataFrame, name: str, factor: float) -> Estimate:
     if name == "settling_time_s":
         return median_with_interval(factor * settling_times(own))
     values = factor * column_of(own, name)
-    return median_with_interval(values, missing="left_out") if values.notna().any() else NO_ESTIMATE
+    if values.isna().all():
+        return NO_ESTIMATE
+    return median_with_interval(values, missing="left_out")
 
 
 def _kind_of(word: str) -> str:
+    """Return the group of columns of an outcome."""
     if word in ACHIEVED:
         return "As asked"
     return "Reached the last period" if word in OUTCOMES else "Ended early"
