@@ -17,6 +17,8 @@ A rule that holds in none of its cases is *not reproduced*, one that holds in so
 `comparison`; in claim 4 a run that never settles counts as its whole duration.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -42,12 +44,14 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.faults import ConfigurationError
 
-CLEAR_RATIO: Final = 2.0  # of step times, so large that every machine shows it
+CLEAR_RATIO: Final = 2.0  # [1] ratio of step times, so large that every machine shows it
 MAX_CIRCLE_ERROR: Final = 0.010  # [m]
 MIN_CIRCLE_SHARE: Final = 0.8
 Tables = Mapping[str, pd.DataFrame]
-DURATION: Final = 10.0  # [s] of a move
-REPRODUCED, NOT_REPRODUCED, DEPENDS = "reproduced", "not reproduced", "depends"
+DURATION: Final = 10.0  # [s] length of a move
+REPRODUCED: Final = "reproduced"
+NOT_REPRODUCED: Final = "not reproduced"
+DEPENDS: Final = "depends"
 UNDECIDED: Final = "too few robots to tell"
 PROPOSED: Final = "rbfnn_mfac"
 MPC: Final = "ukf_mpc"
@@ -83,8 +87,7 @@ class Measurement:
     place: str  # task
     label: str  # controller, reading or pairing
     estimate: Estimate  # value and interval
-    # whether the claim's rule holds here; None for a number that no rule judges, and where the robots are too few to
-    # tell
+    # Whether the claim's rule holds here; None for a number that no rule judges, and where robots are too few to tell
     holds: bool | None = None
 
 
@@ -97,7 +100,7 @@ class Answer:
 
     claim: str  # its number; readings of the paper have a name instead
     statement: str  # the claim in a few words
-    plant: str  # on which the claim was tested
+    plant: str  # the plant on which the claim was tested
     verdict: str  # reproduced, not reproduced, or the cases on which it depends
     evidence: str  # one line
     measurements: tuple[Measurement, ...]  # the numbers, for the table and the figure
@@ -106,7 +109,9 @@ class Answer:
     @property
     def title(self) -> str:
         """Number and statement, or the statement of a reading."""
-        return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
+        if not self.claim.isdigit():
+            return self.statement
+        return f"{self.claim}: {self.statement}"
 
 
 def studies(plants: Sequence[str], seeds: int, division: str, mismatch: str) -> dict[str, Campaign]:
@@ -127,24 +132,21 @@ def studies(plants: Sequence[str], seeds: int, division: str, mismatch: str) -> 
     def cells(
         controllers: tuple[str, ...], tasks: tuple[str, ...], chosen: tuple[int, ...]
     ) -> tuple[Cell, ...]:
-        batch = Batch(
-            tuple(plants), tuple(name + suffix for name in controllers), tasks, (mismatch,), chosen
-        )
+        equipped = tuple(name + suffix for name in controllers)
+        batch = Batch(tuple(plants), equipped, tasks, (mismatch,), chosen)
         return tuple(Cell(request) for request in batch.requests())
 
     four = (PROPOSED, *OTHERS)
-    own = cells((PROPOSED,), (*MOVES, CIRCLE), some)
-    both = cells((PROPOSED, MPC), (*MOVES, CIRCLE), robots[:TIMED_ROBOTS])
-    read = {
-        name: Campaign(own, Settings({**rendered, PROPOSED + suffix: each}))
-        for name, each in READINGS.items()
-    }
     main = cells(four, MOVES, robots) + cells(four, (CIRCLE,), some)
-    return {
+    timed = cells((PROPOSED, MPC), (*MOVES, CIRCLE), robots[:TIMED_ROBOTS])
+    read = cells((PROPOSED,), (*MOVES, CIRCLE), some)
+    campaigns = {
         MAIN: Campaign(main, Settings(rendered)),
-        TIMED: Campaign(both, Settings(rendered), timed=True),
-        **read,
+        TIMED: Campaign(timed, Settings(rendered), timed=True),
     }
+    for name, reading in READINGS.items():
+        campaigns[name] = Campaign(read, Settings({**rendered, PROPOSED + suffix: reading}))
+    return campaigns
 
 
 def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> list[Answer]:
@@ -156,125 +158,106 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
         division: how the methods were equipped, a key of `DIVISIONS`.
 
     Raises:
-        ConfigurationError: of a study, no run reached its last period, so that there is nothing to compare.
+        ConfigurationError: no run of a study reached its last period, so that there is nothing to compare.
     """
     plain = {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
-    here = {name: table[table["plant"] == plant] for name, table in tables.items()}
-    own = {
-        name: table.reset_index(drop=True).replace({"controller": plain})
-        for name, table in here.items()
-    }
+    own = {}
+    for name, table in tables.items():
+        here = table[table["plant"] == plant].reset_index(drop=True)
+        own[name] = here.replace({"controller": plain})
     for name, table in own.items():
         if not (table["status"] == COMPLETED).any():
             raise ConfigurationError(f"no run of {name} on {plant} reached its last period")
+    printed = "reading: both step sizes without ε, as printed"
+    by_entry = "reading: controller network fitted entry by entry"
     answers = [
-        *(
-            rule(own, plant)
-            for rule in (
-                _faster,
-                _overshoot_and_path,
-                _alike,
-                _leaving,
-                _circle,
-                _cheaper,
-                _keeps_up,
-            )
-        ),
-        _reading(own, plant, NO_EPSILON, "ε = 0", "reading: both step sizes without ε, as printed"),
-        _reading(
-            own, plant, ENTRIES, "entries", "reading: controller network fitted entry by entry"
-        ),
+        _faster(own, plant),
+        _overshoot_and_path(own, plant),
+        _alike(own, plant),
+        _leaving(own, plant),
+        _circle(own, plant),
+        _cheaper(own, plant),
+        _keeps_up(own, plant),
+        _reading(own, plant, NO_EPSILON, "ε = 0", printed),
+        _reading(own, plant, ENTRIES, "entries", by_entry),
     ]
     return [replace(answer, division=division) for answer in answers]
 
 
 def _faster(tables: Tables, plant: str) -> Answer:
-    compared = pairings(
-        tables[MAIN], "settling_time_s", "settling time, proposed − rival, mean, s", "better"
-    )
+    panel = "settling time, proposed − rival, mean, s"
+    compared = pairings(tables[MAIN], "settling_time_s", panel, "better")
     middles = medians(tables[MAIN], "settling time, median, s")
-    times = {
-        m: f"{m.estimate.value:.2f} s" if isfinite(m.estimate.value) else "never" for m in middles
-    }
-    words = "; ".join(
-        f"{task} " + ", ".join(f"{m.label} {times[m]}" for m in middles if m.place == task)
-        for task in MOVES
-    )
-    evidence = f"faster in {held(compared)} of {len(compared)} pairings; medians {words}"
+    words = []
+    for task in MOVES:
+        times = [f"{m.label} {_time_in_words(m)}" for m in middles if m.place == task]
+        words.append(f"{task} {', '.join(times)}")
+    evidence = f"faster in {held(compared)} of {len(compared)} pairings; medians {'; '.join(words)}"
     return answer("1", "converges faster than the other three", plant, compared, evidence, middles)
+
+
+def _time_in_words(measurement: Measurement) -> str:
+    """Return a settling time with its unit, or a word where half of the runs or more never settle."""
+    time = measurement.estimate.value
+    return f"{time:.2f} s" if isfinite(time) else "never"
 
 
 def _overshoot_and_path(tables: Tables, plant: str) -> Answer:
     runs = tables[MAIN]
     over = pairings(runs, "overshoot", "overshoot, proposed − rival, mean, %", "worse", 100.0)
     path = pairings(runs, "path_length_ratio", "path ratio, proposed − rival, mean", "worse")
-    evidence = f"larger overshoot in {held(over)} of {len(over)} pairings, longer path in {held(path)} of {len(path)}"
-    return answer(
-        "2", "its overshoot is larger and its path longer", plant, [*over, *path], evidence
-    )
+    larger = f"larger overshoot in {held(over)} of {len(over)} pairings"
+    longer = f"longer path in {held(path)} of {len(path)}"
+    statement = "its overshoot is larger and its path longer"
+    return answer("2", statement, plant, [*over, *path], f"{larger}, {longer}")
 
 
 def _alike(tables: Tables, plant: str) -> Answer:
-    panel, small = (
-        "settling time, ukf_mpc − ukf_mfac, mean, s",
-        margin("settling_time_s", tables[MAIN]),
-    )
-    times = {
-        task: by_seed(tables[MAIN], task, "settling_time_s")[["ukf_mpc", "ukf_mfac"]]
-        for task in MOVES
-    }
-    measured = [judged(panel, task, own, small, "equivalent") for task, own in times.items()]
-    laps = [circle_error(tables[MAIN], name) for name in ("ukf_mfac", "ukf_mpc")]
+    runs = tables[MAIN]
+    panel = "settling time, ukf_mpc − ukf_mfac, mean, s"
+    small = margin("settling_time_s", runs)
+    measured = []
+    for task in MOVES:
+        times = by_seed(runs, task, "settling_time_s")[["ukf_mpc", "ukf_mfac"]]
+        measured.append(judged(panel, task, times, small, "equivalent"))
+    laps = [circle_error(runs, name) for name in ("ukf_mfac", "ukf_mpc")]
     differences = ", ".join(f"{m.place} {m.estimate:.2f} s" for m in measured)
     circle = " against ".join(f"{m.estimate:.1f} mm ({m.label})" for m in laps)
-    return answer(
-        "3",
-        "UKF+MPC and UKF+MFAC behave alike",
-        plant,
-        measured,
-        f"{differences}; circle {circle}",
-        laps,
-    )
+    evidence = f"{differences}; circle {circle}"
+    return answer("3", "UKF+MPC and UKF+MFAC behave alike", plant, measured, evidence, laps)
 
 
 def _leaving(tables: Tables, plant: str) -> Answer:
     runs = tables[MAIN].assign(time=settling_times(tables[MAIN]).fillna(DURATION))
-    parts = (runs[runs["task"].isin(tasks)] for tasks in (LEAVING, STAYING))
-    leaving, staying = (part.pivot_table("time", "seed", "controller") for part in parts)
-    cost = leaving - staying  # [s] by seed and controller
-    pairs = ((PROPOSED, "ukf_mfac"), ("rbf_pid", "ukf_mfac"), (PROPOSED, "rbf_pid"))
-    panel, small = (
-        "extra settling time where the region is left, mean, s",
-        margin("settling_time_s", runs),
-    )
-    measured = [
-        judged(panel, "exp1, exp4", cost[list(pair)].dropna(), small, "worse") for pair in pairs
-    ]
+    cost = _mean_times(runs, LEAVING) - _mean_times(runs, STAYING)  # [s]
+    panel = "extra settling time where the region is left, mean, s"
+    small = margin("settling_time_s", runs)
+    measured = []
+    for pair in ((PROPOSED, "ukf_mfac"), ("rbf_pid", "ukf_mfac"), (PROPOSED, "rbf_pid")):
+        costs = cost[list(pair)].dropna()
+        measured.append(judged(panel, "exp1, exp4", costs, small, "worse"))
     evidence = "; ".join(f"{m.label} {m.estimate:.2f} s" for m in measured)
-    return answer(
-        "4",
-        "outside the region both RBF methods suffer, the proposed more",
-        plant,
-        measured,
-        evidence,
-    )
+    statement = "outside the region both RBF methods suffer, the proposed more"
+    return answer("4", statement, plant, measured, evidence)
+
+
+def _mean_times(runs: pd.DataFrame, tasks: Sequence[str]) -> pd.DataFrame:
+    """Return the mean of the column `time` over some tasks, by seed and controller [s]."""
+    return runs[runs["task"].isin(tasks)].pivot_table("time", "seed", "controller")
 
 
 def _circle(tables: Tables, plant: str) -> Answer:
     measured = [circle_error(tables[MAIN], name) for name in (PROPOSED, *OTHERS)]
     laps = tables[MAIN][tables[MAIN]["task"] == CIRCLE]
     followed = (laps["rms_error_evaluated"] <= MAX_CIRCLE_ERROR) & (laps["status"] == COMPLETED)
-    lost, own = (
-        (~followed).groupby(laps["controller"]).sum(),
-        followed[laps["controller"] == PROPOSED],
-    )
+    lost = (~followed).groupby(laps["controller"]).sum()
+    own = followed[laps["controller"] == PROPOSED]
     good = int(own.sum())
-    rate, most = success_rate(good, len(own)), success_rate(len(own), len(own))
-    holds = (
-        rate.low > MIN_CIRCLE_SHARE
-        if most.low > MIN_CIRCLE_SHARE or rate.high < MIN_CIRCLE_SHARE
-        else None
-    )
+    rate = success_rate(good, len(own))
+    # Few robots cannot show the share even if all of them follow; that it is missed may still show.
+    most = success_rate(len(own), len(own))
+    is_decided = most.low > MIN_CIRCLE_SHARE or rate.high < MIN_CIRCLE_SHARE
+    holds = rate.low > MIN_CIRCLE_SHARE if is_decided else None
     share = Measurement("within 10 mm RMS, share", CIRCLE, PROPOSED, rate, holds)
     words = ", ".join(f"{m.label} {m.estimate:.1f} mm ({lost[m.label]} lost)" for m in measured)
     evidence = f"within 10 mm in {good} of {len(own)}; medians {words}"
@@ -282,96 +265,83 @@ def _circle(tables: Tables, plant: str) -> Answer:
 
 
 def _cheaper(tables: Tables, plant: str) -> Answer:
+    panel = f"step time, proposed over {MPC}"
+    every = tables[TIMED]
     measured = []
     for place, tasks in (("moves", MOVES), (CIRCLE, (CIRCLE,))):
-        runs = tables[TIMED][tables[TIMED]["task"].isin(tasks)]
-        times = runs.pivot_table(
-            index=["task", "seed"], columns="controller", values="controller_time_median_us"
-        )
+        runs = every[every["task"].isin(tasks)]
+        times = runs.pivot_table("controller_time_median_us", ["task", "seed"], "controller")
         ratio = median_with_interval(times[PROPOSED] / times[MPC])
         holds = ratio.value < 1.0 / CLEAR_RATIO
-        measured.append(
-            Measurement(f"step time, proposed over {MPC}", place, PROPOSED, ratio, holds)
-        )
-    words = ", ".join(f"{_in_words(m.estimate.value)} {m.place}" for m in measured)
+        measured.append(Measurement(panel, place, PROPOSED, ratio, holds))
+    words = ", ".join(f"{_ratio_in_words(m.estimate.value)} {m.place}" for m in measured)
     evidence = f"its median step is {words} (a factor of {CLEAR_RATIO:g} counts; the ratios are in measurements.csv)"
-    return answer(
-        "6", "its update costs less time than an optimising MPC", plant, measured, evidence
-    )
+    statement = "its update costs less time than an optimising MPC"
+    return answer("6", statement, plant, measured, evidence)
 
 
-def _in_words(ratio: float) -> str:
+def _ratio_in_words(ratio: float) -> str:
     """Return a ratio of times in words that do not change from machine to machine."""
     if ratio < 1.0 / CLEAR_RATIO:
         return "clearly shorter than that of ukf_mpc in"
-    return (
-        "clearly longer than that of ukf_mpc in"
-        if ratio > CLEAR_RATIO
-        else "about as long as that of ukf_mpc in"
-    )
+    if ratio > CLEAR_RATIO:
+        return "clearly longer than that of ukf_mpc in"
+    return "about as long as that of ukf_mpc in"
 
 
 def _keeps_up(tables: Tables, plant: str) -> Answer:
-    compared = {"online": tables[MAIN], "frozen": tables[FROZEN]}
-    runs = {
-        name: each[each["controller"] == PROPOSED].set_index(["task", "seed"])
-        for name, each in compared.items()
-    }
-    errors = {
-        name: own["jacobian_error_mean"].where(own["status"] == COMPLETED)
-        for name, own in runs.items()
-    }
-    both = pd.DataFrame(errors)
-    small, panel = (
-        margin("jacobian_error_mean", tables[MAIN]),
-        "Jacobian error, online − as trained, mean, %",
-    )
+    online = _jacobian_errors(tables[MAIN])
+    frozen = _jacobian_errors(tables[FROZEN])
+    both = pd.DataFrame({"online": online, "frozen": frozen})
+    small = margin("jacobian_error_mean", tables[MAIN])
     measured, levels, words = [], [], []
     for task in (*MOVES, CIRCLE):
+        panel = "Jacobian error, online − as trained, mean, %"
         own = judged(panel, task, 100.0 * both.loc[[task]], 100.0 * small, "better")
         measured.append(replace(own, label=PROPOSED))
-        level = {
-            name: median_with_interval(100.0 * both.loc[task][name])
-            for name in ("online", "frozen")
-        }
-        levels += [
-            Measurement("Jacobian error, mean of a run, %", task, name, level[name])
-            for name in level
-        ]
-        words.append(
-            f"{task} {number(level['online'].value, '.1f')} / {number(level['frozen'].value, '.1f')} %"
-        )
+        middles = []
+        for name in ("online", "frozen"):
+            middle = median_with_interval(100.0 * both.loc[task][name])
+            middles.append(number(middle.value, ".1f"))
+            levels.append(Measurement("Jacobian error, mean of a run, %", task, name, middle))
+        words.append(f"{task} {' / '.join(middles)} %")
     evidence = f"median error online / as trained: {', '.join(words)}"
-    return answer(
-        "7", "its estimator keeps up with the true Jacobian", plant, measured, evidence, levels
-    )
+    statement = "its estimator keeps up with the true Jacobian"
+    return answer("7", statement, plant, measured, evidence, levels)
+
+
+def _jacobian_errors(runs: pd.DataFrame) -> pd.Series[float]:
+    """Return the mean Jacobian error of each completed run of the proposed method, by task and seed."""
+    own = runs[runs["controller"] == PROPOSED].set_index(["task", "seed"])
+    return own["jacobian_error_mean"].where(own["status"] == COMPLETED)
 
 
 def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) -> Answer:
     """Compare the proposed method in another reading of the paper with the one that is the default here."""
-    usual = tables[MAIN][
-        (tables[MAIN]["controller"] == PROPOSED) & tables[MAIN]["seed"].isin(tables[name]["seed"])
-    ]
-    measured, words, settled = [], [], []
-    for kind, table in (("default", usual), (label, tables[name])):
-        moves = table[table["task"].isin(MOVES)].set_index(["task", "seed"])
-        times = settling_times(moves)
-        share, time = (
-            success_rate(int(times.notna().sum()), len(moves)),
-            median_with_interval(times),
-        )
+    runs = tables[MAIN]
+    other = tables[name]
+    usual = runs[(runs["controller"] == PROPOSED) & runs["seed"].isin(other["seed"])]
+    measured, words = [], []
+    for kind, table in (("default", usual), (label, other)):
+        times = _times_of_moves(table)
+        share = success_rate(int(times.notna().sum()), len(times))
+        time = median_with_interval(times)
         lap = circle_error(table, PROPOSED, kind)
         measured.append(Measurement("moves that settled, share", "moves", kind, share))
-        measured += [Measurement("settling time, median, s", "moves", kind, time), lap]
-        words.append(
-            f"{kind}: settled {100 * share.value:.0f} %, median {time:.2f} s, circle {lap.estimate:.1f} mm"
-        )
-        settled.append(times)
-    found = paired_difference(
-        *settled[1].align(settled[0], join="inner"), margin("settling_time_s", usual)
-    )
+        measured.append(Measurement("settling time, median, s", "moves", kind, time))
+        measured.append(lap)
+        settled = f"settled {100 * share.value:.0f} %"
+        words.append(f"{kind}: {settled}, median {time:.2f} s, circle {lap.estimate:.1f} mm")
+    first, second = _times_of_moves(other).align(_times_of_moves(usual), join="inner")
+    found = paired_difference(first, second, margin("settling_time_s", usual))
     words.append(f"mean difference {found.mean:+.2f} s, lost {found.lost[0]} : {found.lost[1]}")
     return Answer(label, statement, plant, found.verdict, "; ".join(words), tuple(measured))
+
+
+def _times_of_moves(runs: pd.DataFrame) -> pd.Series[float]:
+    """Return the settling times of moves by task and seed [s]; NaN where a run never settled."""
+    moves = runs[runs["task"].isin(MOVES)]
+    return settling_times(moves.set_index(["task", "seed"]))
 
 
 def judged(
@@ -395,14 +365,15 @@ def pairings(
         wanted: verdict; with `worse`, larger, a lost run leaves its pair out instead of being worse than any.
         factor: from the column's unit to the panel's.
     """
-    small, found = factor * margin(metric, runs), []
+    small = factor * margin(metric, runs)
+    found = []
     for task in MOVES:
         values = factor * by_seed(runs, task, metric)
         for rival in OTHERS:
             pair = values[[PROPOSED, rival]]
-            measured = judged(
-                panel, task, pair.dropna() if wanted == "worse" else pair, small, wanted
-            )
+            if wanted == "worse":
+                pair = pair.dropna()
+            measured = judged(panel, task, pair, small, wanted)
             found.append(replace(measured, label=rival))
     return found
 
@@ -427,9 +398,8 @@ def medians(runs: pd.DataFrame, panel: str) -> list[Measurement]:
 def circle_error(runs: pd.DataFrame, controller: str, label: str = "") -> Measurement:
     """Return the median RMS error of the second lap [mm]; infinite if half of the runs do not complete."""
     own = runs[(runs["task"] == CIRCLE) & (runs["controller"] == controller)]
-    error = median_with_interval(
-        1000.0 * own["rms_error_evaluated"].where(own["status"] == COMPLETED)
-    )
+    completed = own["rms_error_evaluated"].where(own["status"] == COMPLETED)
+    error = median_with_interval(1000.0 * completed)
     return Measurement("circle, RMS of the second lap, mm", CIRCLE, label or controller, error)
 
 
@@ -442,11 +412,14 @@ def answer(
     claim: str, statement: str, plant: str, cases: Cases, evidence: str, further: Cases = ()
 ) -> Answer:
     """Return the answer whose verdict follows from the cases judged; `further` measurements are for the figure."""
-    count, decided = held(cases), sum(m.holds is not None for m in cases)
+    count = held(cases)
+    decided = sum(m.holds is not None for m in cases)
     if count == len(cases):
         verdict = REPRODUCED
     elif count == decided:
         verdict = UNDECIDED
+    elif count == 0:
+        verdict = NOT_REPRODUCED
     else:
-        verdict = f"{DEPENDS}: holds in {count} of {decided}" if count else NOT_REPRODUCED
+        verdict = f"{DEPENDS}: holds in {count} of {decided}"
     return Answer(claim, statement, plant, verdict, evidence, (*cases, *further))

@@ -39,7 +39,9 @@ MAX_LABEL = 28  # characters of an ordinate's label on one line
 ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
 NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
-RELATIVE, ABSOLUTE = 0.1, 0.051  # tolerances of the numbers in the evidence: a tenth and a period
+# Tolerances of the numbers in the evidence: a tenth, and a period
+RELATIVE: Final = 0.1  # [1]
+ABSOLUTE: Final = 0.051  # [s] for times
 # Claim, plant, division -> verdict, evidence
 Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]
 
@@ -76,23 +78,21 @@ def reproduce(
             "the claims are about a UR5; --plants names a plant with a robot of its own"
         )
     made = {division: studies(plants, robots, division, mismatch) for division in divisions}
-    answers, main = [], {}
+    answers: list[Answer] = []
+    main = {}
     with locked(out):
         for division, parts in made.items():
             folder = out / division.replace(" ", "_")
             tables = carry_out_parts(parts, folder, how)
-            answers += [
-                answer for plant in plants for answer in answer_all(tables, plant, division)
-            ]
+            for plant in plants:
+                answers += answer_all(tables, plant, division)
             main[division] = tables[MAIN]
             manifest = results.read_manifest(folder / MAIN)
         answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
         results.write_summary(out, main, manifest)
         write_tables(answers, out)
-        write_atomically(
-            out / "answers.md",
-            partial(Path.write_text, data=markdown_table(answers), encoding="utf-8"),
-        )
+        write = partial(Path.write_text, data=markdown_table(answers), encoding="utf-8")
+        write_atomically(out / "answers.md", write)
         draw_answers(answers, out / FIGURES)
     return answers
 
@@ -111,10 +111,12 @@ def _draw(answers: Sequence[Answer]) -> Figure:
     grid = figure.subplots(len(panels), len(answers), squeeze=False, sharey="row")
     for column, answer in enumerate(answers):
         for row, panel in enumerate(panels):
-            _draw_panel(grid[row, column], [m for m in answer.measurements if m.panel == panel])
+            measured = [m for m in answer.measurements if m.panel == panel]
+            _draw_panel(grid[row, column], measured)
         grid[0, column].set_title(f"{answer.plant}, {answer.division}:\n{answer.verdict}")
     for row, panel in enumerate(panels):
-        grid[row, 0].set_ylabel(panel if len(panel) < MAX_LABEL else panel.replace(", ", ",\n", 1))
+        label = panel if len(panel) < MAX_LABEL else panel.replace(", ", ",\n", 1)
+        grid[row, 0].set_ylabel(label)
     figure.suptitle(answers[0].title)
     return figure
 
@@ -132,32 +134,38 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
     draw_places(axes, range(len(places)), values, method_styles(labels))
     axes.set_xticks(range(len(places)), places)
     axes.set_xlim(-0.6, len(places) - 0.4)
-    if (
-        "−" in measured[0].panel or " over " in measured[0].panel
-    ):  # a difference or a ratio: a line at "alike"
-        axes.axhline(0.0 if "−" in measured[0].panel else 1.0, color="black", linewidth=0.8)
+    panel = measured[0].panel
+    if "−" in panel:
+        _draw_alike(axes, 0.0)  # a difference
+    elif " over " in panel:
+        _draw_alike(axes, 1.0)  # a ratio
     else:
         ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
-        axes.set_ylim(0.0, 1.15 * max(1e-9, float(np.max(ends[np.isfinite(ends)], initial=0.0))))
+        highest = float(np.max(ends[np.isfinite(ends)], initial=0.0))
+        axes.set_ylim(0.0, 1.15 * max(1e-9, highest))
     axes.grid(visible=True, alpha=0.3)
-    if axes.get_legend_handles_labels()[
-        0
-    ]:  # none where no run gives a number, as moves too short to settle
+    handles, _ = axes.get_legend_handles_labels()
+    if handles:  # none where no run gives a number, as in moves too short to settle
         axes.legend(fontsize=7, frameon=False)
+
+
+def _draw_alike(axes: Axes, level: float) -> None:
+    """Draw a line where two methods are alike."""
+    axes.axhline(level, color="black", linewidth=0.8)
 
 
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:
     """Write a row for each claim, plant and division, and a row for each number behind the answers."""
     table = pd.DataFrame(answers).drop(columns="measurements")
     write_atomically(folder / ANSWERS, partial(table.to_csv, index=False))
-    rows = [
-        {"claim": answer.claim, "plant": answer.plant, "division": answer.division,
-         "measured": m.panel, "place": m.place, "label": m.label,
-         **asdict(m.estimate), "holds": m.holds}
-        for answer in answers
-        for m in answer.measurements
-    ]  # fmt: skip
-    write_atomically(folder / MEASUREMENTS, partial(pd.DataFrame(rows).to_csv, index=False))
+    rows = []
+    for answer in answers:
+        about = {"claim": answer.claim, "plant": answer.plant, "division": answer.division}
+        for m in answer.measurements:
+            measured = {"measured": m.panel, "place": m.place, "label": m.label}
+            rows.append({**about, **measured, **asdict(m.estimate), "holds": m.holds})
+    measurements = pd.DataFrame(rows)
+    write_atomically(folder / MEASUREMENTS, partial(measurements.to_csv, index=False))
 
 
 def read_answers(path: Path) -> Answers:
@@ -168,23 +176,25 @@ def read_answers(path: Path) -> Answers:
     Raises:
         ConfigurationError: the file is not a table of answers.
     """
-    text, columns = (
-        read_text("table of answers", path),
-        ["claim", "plant", "division", "verdict", "evidence"],
-    )
+    text = read_text("table of answers", path)
+    columns = ["claim", "plant", "division", "verdict", "evidence"]
     try:
         table = pd.read_csv(
-            io.StringIO(text), dtype=str, keep_default_na=False, comment="#", usecols=columns
+            io.StringIO(text),
+            dtype=str,
+            keep_default_na=False,
+            comment="#",
+            usecols=columns,
         )
     except ValueError as error:
         wanted = f"with the columns {', '.join(columns)}, such as {ANSWERS} of a folder of claims"
         raise ConfigurationError(
             f"{path} is not a table of answers: wanted one {wanted}"
         ) from error
-    return {
-        tuple(key): (verdict, evidence)
-        for *key, verdict, evidence in table[columns].itertuples(index=False)
-    }
+    answers: dict[tuple[str, ...], tuple[str, str]] = {}
+    for claim, plant, division, verdict, evidence in table[columns].itertuples(index=False):
+        answers[claim, plant, division] = (verdict, evidence)
+    return answers
 
 
 def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
@@ -199,15 +209,20 @@ def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
         key = answer.claim, answer.plant, answer.division
         if key not in wanted:
             lines.append(f"{name}: not in the table")
-        elif wanted[key][0] != answer.verdict or not _agree(answer.evidence, wanted[key][1]):
+            continue
+        verdict, evidence = wanted[key]
+        if verdict != answer.verdict or not _agree(answer.evidence, evidence):
             lines.append(f"{name}: now {answer.verdict}: {answer.evidence}")
     return lines
 
 
 def _agree(found: str, wanted: str) -> bool:
-    ours, theirs = ([float(number) for number in NUMBER.findall(text)] for text in (found, wanted))
-    same_words = NUMBER.sub("", found) == NUMBER.sub("", wanted)
-    return same_words and bool(np.allclose(ours, theirs, rtol=RELATIVE, atol=ABSOLUTE))
+    """Return whether two lines of evidence have the same words and nearly the same numbers."""
+    if NUMBER.sub("", found) != NUMBER.sub("", wanted):
+        return False
+    ours = [float(number) for number in NUMBER.findall(found)]
+    theirs = [float(number) for number in NUMBER.findall(wanted)]
+    return bool(np.allclose(ours, theirs, rtol=RELATIVE, atol=ABSOLUTE))
 
 
 def markdown_table(answers: Sequence[Answer]) -> str:
@@ -224,18 +239,20 @@ def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
 
     In how many comparisons a claim holds is not compared, nor a verdict for which robots were too few.
     """
-    same = [
-        other
+    own = _kind_of_verdict(answer)
+    if own == UNDECIDED:
+        return ""
+    verdicts = {
+        other.plant: _kind_of_verdict(other)
         for other in answers
-        if (other.claim, other.division) == (answer.claim, answer.division)
-    ]
-    verdicts, own = (
-        {other.plant: other.verdict.partition(":")[0] for other in same},
-        answer.verdict.partition(":")[0],
-    )
-    others = [
-        plant
-        for plant, verdict in verdicts.items()
-        if verdict != own and UNDECIDED not in (verdict, own)
-    ]
-    return f" (otherwise on {', '.join(others)})" if others else ""
+        if other.claim == answer.claim and other.division == answer.division
+    }
+    others = [plant for plant, each in verdicts.items() if each not in (own, UNDECIDED)]
+    if not others:
+        return ""
+    return f" (otherwise on {', '.join(others)})"
+
+
+def _kind_of_verdict(answer: Answer) -> str:
+    """Return a verdict without the number of cases in which it holds."""
+    return answer.verdict.partition(":")[0]

@@ -46,7 +46,7 @@ DURATION: Final = "task.duration"
 LONGER: Final[Varied] = ((DURATION, 20.0),)  # [s], settings of a run whose camera is moved half-way
 FIGURES: Final = "figures"
 LIMITS: Final = "predicted_limits.csv"
-NOTE: Final = 115  # letters of a line below it
+NOTE: Final = 115  # letters on a line of the notes below the title
 MOVE: Final = "camera_move"
 LATENCY: Final = "latency"
 NOISE: Final = "noise"
@@ -57,7 +57,7 @@ Measure: TypeAlias = Callable[[pd.DataFrame], comparison.Estimate]  # of the run
 class Line:
     """An axis of the map."""
 
-    axis: str  # of the mismatch, the sensor's among them, or "latency" or "noise"
+    axis: str  # an axis of the mismatch, the sensor's among them, or "latency" or "noise"
     title: str  # label of the axis
     places: tuple[Magnitude, ...]  # its magnitudes
 
@@ -122,24 +122,22 @@ def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONG
     """Return the runs of the map; those whose camera is moved have the settings `moving`."""
 
     def cell(place: Place, request: RunRequest) -> Cell:
+        """Return the run of a request at a place: latency and noise are settings, all else is mismatch."""
         number = 0.0 if place.magnitude is None else place.magnitude.number
-        known: dict[str, Varied] = {
-            LATENCY: ((LATENCY, number / 1000.0),),
-            NOISE: ((NOISE, number),),
-            MOVE: moving,
-        }
-        mismatch = (
-            request.mismatch if place.axis in (LATENCY, NOISE) else place.vary(request.mismatch)
-        )
-        return Cell(
-            replace(request, mismatch=mismatch, varied=known.get(place.axis, ())), place.columns
-        )
+        varied: Varied = ()
+        mismatch = request.mismatch
+        if place.axis == LATENCY:
+            varied = ((LATENCY, number / 1000.0),)
+        elif place.axis == NOISE:
+            varied = ((NOISE, number),)
+        else:
+            mismatch = place.vary(mismatch)
+        if place.axis == MOVE:
+            varied = moving
+        return Cell(replace(request, mismatch=mismatch, varied=varied), place.columns)
 
-    return Grid(
-        cell,
-        [Place(line.axis, magnitude) for line in lines for magnitude in line.places],
-        batch.requests(),
-    )
+    places = [Place(line.axis, magnitude) for line in lines for magnitude in line.places]
+    return Grid(cell, places, batch.requests())
 
 
 def make_map(
@@ -168,13 +166,12 @@ def make_map(
     # A duration that a user gives is kept
     moving = () if "duration" in settings.sections.get(TASK, {}) else LONGER
     carry_out(Campaign(map_cells(batch, lines, moving), settings), out, how)
-    linear = (
-        batch.sensings == (DEFAULT_SENSING,)
-        and plant not in RENDERED
-        and find_robot(batch.robot).twin is None
-    )
-    drawn = linear and any(line.axis == LATENCY for line in lines)
-    limits = predicted_limits(batch.controllers, settings, batch.robot, plant) if drawn else {}
+    has_model = plant not in RENDERED and find_robot(batch.robot).twin is None
+    has_usual_camera = batch.sensings == (DEFAULT_SENSING,)
+    varies_latency = any(line.axis == LATENCY for line in lines)
+    limits = {}
+    if has_model and has_usual_camera and varies_latency:
+        limits = predicted_limits(batch.controllers, settings, batch.robot, plant)
     column = pd.Series(limits, name="predicted_latency_limit_s")
     write_atomically(out / LIMITS, partial(column.to_csv, index_label="controller"))
     return draw_map(map_runs(out), out / FIGURES, limits)
@@ -194,10 +191,8 @@ def predicted_limits(
     known = {field.name for field in fields(KinematicConfig)}
     own = {key: value for key, value in settings.sections.get(plant, {}).items() if key in known}
     latencies = [place.number / 1000.0 for place in KNOWN_LINES[LATENCY].places]
-    run, config = (
-        settings.resolve("run", RunSettings()),
-        Settings({plant: own}).resolve(plant, KinematicConfig()),
-    )
+    run = settings.resolve("run", RunSettings())
+    config = Settings({plant: own}).resolve(plant, KinematicConfig())
     limits = {}
     for name in controllers:
         entry = find_controller(name)
@@ -213,12 +208,12 @@ def map_runs(folder: Path) -> pd.DataFrame:
     Raises:
         ConfigurationError: not the folder of a map.
     """
-    runs, configuration = results.load_runs(folder), results.read_manifest(folder)["configuration"]
+    runs = results.load_runs(folder)
+    configuration = results.read_manifest(folder)["configuration"]
     durations = comparison.column_of(runs, DURATION).fillna(configuration[TASK]["duration"])
-    moved = (runs["axis"] == MOVE) & (runs["magnitude"] > 0.0)
-    return runs.assign(
-        moved_at_s=(configuration["run"]["camera_moves_at"] * durations).where(moved)
-    )
+    share = configuration["run"]["camera_moves_at"]  # [1] of a run's duration
+    is_moved = (runs["axis"] == MOVE) & (runs["magnitude"] > 0.0)
+    return runs.assign(moved_at_s=(share * durations).where(is_moved))
 
 
 def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> list[Path]:
@@ -226,7 +221,7 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> l
 
     Args:
         runs: the table of the map's runs.
-        folder: where; made if needed.
+        folder: folder of the files; made if needed.
         limits: predicted limits of the latency by method, see `predicted_limits`.
 
     Returns:
@@ -236,9 +231,8 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> l
     took = "Median settling time, from the move where the camera moves"
     share = _draw(runs, limits, comparison.settled_share, arrived, "settled runs [%]", 104.0)
     time = _draw(runs, limits, settling_median, took, "settling time [s]", 10.0)
-    return style.save_figure(share, folder / "robustness") + style.save_figure(
-        time, folder / "robustness_settling"
-    )
+    files = style.save_figure(share, folder / "robustness")
+    return files + style.save_figure(time, folder / "robustness_settling")
 
 
 def settling_median(runs: pd.DataFrame) -> comparison.Estimate:
@@ -259,51 +253,30 @@ def _draw(
     top: float,
 ) -> Figure:
     """Draw a measure of the runs at each place of the map, with a title, its label and the upper edge of the panels."""
-    controllers = list(dict.fromkeys(runs["controller"]))
-    styles = style.method_styles(controllers)
-    curves = {}
-    for axis, line in KNOWN_LINES.items():
-        if axis in set(runs["axis"]):
-            cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))
-            numbers = [place.number for place in line.places]
-            curves[axis] = {
-                name: [measure(cells[name, each]) for each in numbers] for name in controllers
-            }
-    # All methods, and at all places:
-    alike = [axis for axis, each in curves.items() if len(same_curves(each)) == 1]
+    styles = style.method_styles(list(dict.fromkeys(runs["controller"])))
+    curves = _curves(runs, measure)
+    # An axis along which all methods have one value at all places says nothing; it is named, not drawn.
     flat = [
         axis
-        for axis in alike
-        if len({e.value for each in curves[axis].values() for e in each}) == 1
+        for axis, each in curves.items()
+        if len(same_curves(each)) == 1 and len(_values(each)) == 1
     ]
-    lines = [KNOWN_LINES[axis] for axis in curves if axis not in flat or len(flat) == len(curves)]
-    robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
+    some_flat = 0 < len(flat) < len(curves)
+    lines = [KNOWN_LINES[axis] for axis in curves if not (some_flat and axis in flat)]
     with style.figure_style(style.TEXT):
         figure, panels = style.panel_grid(len(lines), 1.9, head=1.5)
         for axes, line in zip(panels, lines, strict=True):
-            draw_curves(
-                axes, [place.number for place in line.places], curves[line.axis], styles, top
-            )
-            axes.set_xticks([place.number for place in line.places])
+            numbers = [place.number for place in line.places]
+            draw_curves(axes, numbers, curves[line.axis], styles, top)
+            axes.set_xticks(numbers)
             axes.set_xlabel(line.title)
             if line.axis == LATENCY and limits:
                 _mark_limits(axes, line, limits, styles)
         style.label_rows(panels, label)
-        arm = runs["robot"].iloc[0]
-        which = (
-            f"robots a point on {plant}"
-            if arm == DEFAULT_ROBOT
-            else f"{Path(arm).stem} a point on {plant}"
-        )
-        notes = [f"{robots} {which}, bands are 95 % intervals"]
-        if 0 < len(flat) < len(curves):
+        notes = [f"{_robots_in_words(runs)}, bands are 95 % intervals"]
+        if some_flat:
             notes.append(_name_flat(flat, curves))
-        if any(
-            np.isinf(e.value)
-            for axis in curves.values()
-            for estimates in axis.values()
-            for e in estimates
-        ):
+        if any(np.isinf(value) for each in curves.values() for value in _values(each)):
             notes.append("carets at the upper edge: half of the runs or more never settle")
         words = "\n".join(textwrap.fill(note, NOTE) for note in notes)
         figure.suptitle(f"{title}\n{words}", fontsize=style.TEXT + 0.5)
@@ -311,28 +284,58 @@ def _draw(
     return figure
 
 
+def _curves(runs: pd.DataFrame, measure: Measure) -> dict[str, Curves]:
+    """Return a measure of the runs at each place of each axis, by axis and method."""
+    controllers = list(dict.fromkeys(runs["controller"]))
+    known = set(runs["axis"])
+    curves: dict[str, Curves] = {}
+    for axis, line in KNOWN_LINES.items():
+        if axis in known:
+            cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))
+            numbers = [place.number for place in line.places]
+            curves[axis] = {
+                name: [measure(cells[name, number]) for number in numbers] for name in controllers
+            }
+    return curves
+
+
+def _values(curves: Curves) -> set[float]:
+    """Return the different values of all methods along an axis."""
+    return {estimate.value for estimates in curves.values() for estimate in estimates}
+
+
+def _robots_in_words(runs: pd.DataFrame) -> str:
+    """Return how many robots of which kind each point of the map has."""
+    arm = runs["robot"].iloc[0]
+    kind = "robots" if arm == DEFAULT_ROBOT else Path(arm).stem
+    return f"{runs['seed'].nunique()} {kind} a point on {runs['plant'].iloc[0]}"
+
+
 def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
     """Return a sentence on the axes along which nothing differs."""
     found = next(iter(curves[flat[0]].values()))[0]
-    lines = [KNOWN_LINES[axis] for axis in flat]
-    words = "; ".join(
-        re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title) for line in lines
-    )
-    return f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: {words}"
+    ends = []
+    for axis in flat:
+        line = KNOWN_LINES[axis]
+        # The unit in the title, " [mm]", becomes the last magnitude with it, " 100 mm".
+        ends.append(re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title))
+    value = f"{found.value:g} (interval from {found.low:.0f})"
+    return f"not drawn, as every method has {value} throughout: {'; '.join(ends)}"
 
 
 def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: style.Styles) -> None:
     """Draw a vertical line where each method is predicted to become unstable, if that is on the axis."""
     last = line.places[-1].number
-    drawn = {
-        name: 1000.0 * limit
-        for name, limit in limits.items()
-        if name in styles and 1000.0 * limit <= last
-    }
-    for name, limit in drawn.items():
-        axes.axvline(
-            limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6
-        )
-    beyond = ", others beyond" * (len(drawn) < len(limits))
-    words = f"upright: predicted limit of stability of {', '.join(drawn)}{beyond}"
-    axes.set_xlabel(f"{line.title}\n{textwrap.fill(words, NOTE // 3)}" if drawn else line.title)
+    drawn = []
+    for name, limit in limits.items():
+        at = 1000.0 * limit  # [ms]
+        if name in styles and at <= last:
+            look = styles[name]
+            axes.axvline(at, color=look.colour, linestyle=look.line, linewidth=1.6, alpha=0.6)
+            drawn.append(name)
+    if not drawn:
+        return
+    words = f"upright: predicted limit of stability of {', '.join(drawn)}"
+    if len(drawn) < len(limits):
+        words += ", others beyond"
+    axes.set_xlabel(f"{line.title}\n{textwrap.fill(words, NOTE // 3)}")
