@@ -100,7 +100,8 @@ class RunningStudy:
                 self.asked += 1
                 self.wanted = nested_settings(self._course.send(score(costs)))
             except StopIteration as end:
-                self.wanted, self.outcome = None, end.value
+                self.wanted = None
+                self.outcome = end.value
 
 
 @final
@@ -113,18 +114,19 @@ class Method:
         Raises:
             ConfigurationError: a file of the folder is no ledger, or one of other settings or runs.
         """
-        self.name, self._plan = name, plan
+        self.name = name
+        self._plan = plan
         self.ledger = open_ledger(folder, name, plan.runs)
         self.second = open_ledger(folder, name, plan.runs.second(), SECOND)
         entry = find_tunable(name)
         self._default = nested_settings(default_values(entry))
         self._known = [self._default, nested_settings(tuned_point(entry))]
-        space, first = find_space(name), first_points(name)
-        seeds = range(plan.study_seed, plan.study_seed + plan.studies)
-        self.studies = [
-            RunningStudy(study(name, space, first, plan.trials, plan.search, seed))
-            for seed in seeds
-        ]
+        space = find_space(name)
+        first = first_points(name)
+        self.studies = []
+        for seed in range(plan.study_seed, plan.study_seed + plan.studies):
+            course = study(name, space, first, plan.trials, plan.search, seed)
+            self.studies.append(RunningStudy(course))
 
     @property
     def done(self) -> int:
@@ -134,23 +136,24 @@ class Method:
 
     def wanted(self) -> list[Wanted]:
         """Return the points that its studies ask for, after they went on as far as the ledger knows."""
+        wanted: list[Wanted] = []
         for each in self.studies:
             each.advance(self.ledger)
-        return [
-            (self.ledger, self.name, each.wanted)
-            for each in self.studies
-            if each.wanted is not None
-        ]
+            if each.wanted is not None:
+                wanted.append((self.ledger, self.name, each.wanted))
+        return wanted
 
     def wanted_on_second(self) -> list[Wanted]:
         """Return the points to score on the second set, once all studies have ended: their results and known values."""
-        outcomes = [each.outcome for each in self.studies if each.outcome is not None]
-        points = (
-            [*self._scored(), *(each.settings for each in outcomes)]
-            if len(outcomes) == len(self.studies)
-            else []
-        )
+        outcomes = self._outcomes()
+        if len(outcomes) < len(self.studies):
+            return []
+        points = [*self._scored(), *(each.settings for each in outcomes)]
         return [(self.second, self.name, point) for point in points]
+
+    def _outcomes(self) -> list[StudyRecord]:
+        """Return the results of the studies that have ended."""
+        return [each.outcome for each in self.studies if each.outcome is not None]
 
     def _scored(self) -> list[Mapping[str, Any]]:
         """Return the defaults and the values in use, as far as they were scored: a study may have a single trial."""
@@ -161,33 +164,41 @@ class Method:
 
         They are the best ones on the second set: of a study, the defaults, or the values in use so far.
         """
-        outcomes = [each.outcome for each in self.studies if each.outcome is not None]
+        outcomes = self._outcomes()
+        if len(outcomes) < len(self.studies):
+            return None
         candidates = [*(each.settings for each in outcomes), *self._scored()]
-        costs = [each for each in map(self.second.costs, candidates) if each is not None]
-        if len(outcomes) < len(self.studies) or len(costs) < len(candidates):
+        second_costs = [each for each in map(self.second.costs, candidates) if each is not None]
+        if len(second_costs) < len(candidates):
             return None
-        mean = [score(each) for each in costs]
-        best, runs = candidates[mean.index(min(mean))], self._plan.runs
-        mine, theirs = self.ledger.costs(best), self.ledger.costs(self._default)
-        on_second = self.second.costs(self._default)
-        if mine is None or theirs is None or on_second is None:
+        second_scores = [score(each) for each in second_costs]
+        best = candidates[second_scores.index(min(second_scores))]
+        own = self.ledger.costs(best)
+        of_defaults = self.ledger.costs(self._default)
+        second_of_defaults = self.second.costs(self._default)
+        if own is None or of_defaults is None or second_of_defaults is None:
             return None
+        runs = self._plan.runs
         checked = runs.checked()
+        records = [
+            replace(each, second_score=second)
+            for each, second in zip(outcomes, second_scores, strict=False)
+        ]
         return TunedValues(
             controller=self.name,
             **asdict(runs),
-            runs_a_trial=len(mine),
-            runs_of_second_set=len(on_second),
+            runs_a_trial=len(own),
+            runs_of_second_set=len(second_of_defaults),
             date=datetime.now(UTC).date().isoformat(),
             version=version("servobench"),
-            score=score(mine),
-            score_of_defaults=score(theirs),
-            second_score=min(mean),
-            second_score_of_defaults=score(on_second),
-            checked_score=score([mine[i] for i in checked]),
-            checked_score_of_defaults=score([theirs[i] for i in checked]),
+            score=score(own),
+            score_of_defaults=score(of_defaults),
+            second_score=min(second_scores),
+            second_score_of_defaults=score(second_of_defaults),
+            checked_score=score([own[i] for i in checked]),
+            checked_score_of_defaults=score([of_defaults[i] for i in checked]),
             settings=best,
-            studies=tuple(replace(each, second_score=mean[i]) for i, each in enumerate(outcomes)),
+            studies=tuple(records),
             edges=edge_lines(self.name, best),
         )
 
@@ -198,11 +209,11 @@ def check_study_folder(folder: Path) -> None:
     Raises:
         ConfigurationError: names the folder.
     """
-    names = (
-        [path.name for path in folder.iterdir()]
-        if folder.is_dir()
-        else [folder.name] * folder.exists()
-    )
+    names = []
+    if folder.is_dir():
+        names = [path.name for path in folder.iterdir()]
+    elif folder.exists():
+        names = [folder.name]
     if set(names) - {LOCK} and not any(name.endswith(LEDGER) for name in names):
         raise ConfigurationError(
             f"{folder} exists already and holds no study; name another folder with --out"
@@ -217,7 +228,8 @@ def open_methods(folder: Path, plan: TuningPlan) -> list[Method]:
     """
     methods = [Method(folder, name, plan) for name in plan.controllers]
     for method in methods:  # an error that no setting can cure is reported before any run
-        Trial(method.name, default_config(find_tunable(method.name))).build(plan.runs.runs())
+        config = default_config(find_tunable(method.name))
+        Trial(method.name, config).build(plan.runs.runs())
     return methods
 
 
@@ -234,9 +246,10 @@ def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> It
         under_way = bool(wanted)
         yield from methods
         chosen = [point for method in methods for point in method.wanted_on_second()]
-        for points, runs in ((wanted, plan.runs), (chosen, plan.runs.second())):
-            for name in fill(points, runs, workers):
-                yield by_name[name]
+        for name in fill(wanted, plan.runs, workers):
+            yield by_name[name]
+        for name in fill(chosen, plan.runs.second(), workers):
+            yield by_name[name]
 
 
 def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, TunedValues]:
@@ -244,7 +257,11 @@ def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, Tuned
 
     Results without a run that ended well are of no use and not written.
     """
-    results = {method.name: tuned for method in methods if (tuned := method.result()) is not None}
+    results = {}
+    for method in methods:
+        tuned = method.result()
+        if tuned is not None:
+            results[method.name] = tuned
     for name, tuned in results.items():
         if not tuned.lost:
             write_tuned(folder / f"{file_stem(name)}.toml", tuned)
@@ -256,26 +273,24 @@ class TunedValues:
     """The results of all studies of a method, and the values that were best on the second set."""
 
     controller: str
-    plants: tuple[str, ...]  # on which the runs took place
-    robots: int  # under each condition (`--robots`)
-    offset: int  # of the seeds in the tuning range (`--offset`)
+    plants: tuple[str, ...]  # plants on which the runs took place
+    robots: int  # robots under each condition (`--robots`)
+    offset: int  # where in the tuning range the seeds begin (`--offset`)
     runs_a_trial: int
     runs_of_second_set: int
     date: str  # day on which the file was written, UTC
-    version: str  # of servobench
-    score: float  # of these values
-    score_of_defaults: float  # of the defaults of the controller's class
-    second_score: float  # of these values on the second set of robots
+    version: str  # servobench's version
+    score: float  # score of these values
+    score_of_defaults: float  # score of the defaults of the controller's class
+    second_score: float  # score of these values on the second set of robots
     second_score_of_defaults: float
-    checked_score: float  # of these values on the subset `TuningSet.checked`
+    checked_score: float  # score of these values on the subset `TuningSet.checked`
     checked_score_of_defaults: float
     settings: Mapping[str, Any]  # nested values
-    studies: tuple[
-        StudyRecord, ...
-    ]  # empty for values that were found under another objective and only scored anew
-    edges: tuple[
-        str, ...
-    ] = ()  # a line for each number at an edge of its box, which is wider in the next study
+    # Empty for values that were found under another objective and only scored anew.
+    studies: tuple[StudyRecord, ...]
+    # A line for each number at an edge of its box, which is wider in the next study
+    edges: tuple[str, ...] = ()
 
     @property
     def lost(self) -> bool:
@@ -285,33 +300,40 @@ class TunedValues:
 
 def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
     """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
-    values, boxes = flatten(nested), dict[str, Any](find_space(name))
-    ends = ((key, end, boxes[key]) for key, end in edges(boxes, values).items())
-    return tuple(
-        f"{key} = {values[key]:.4g} is at the {end} edge of {b.low:g} to {b.high:g}"
-        for key, end, b in ends
-    )
+    values = flatten(nested)
+    boxes: dict[str, Any] = dict(find_space(name))
+    lines = []
+    for key, end in edges(boxes, values).items():
+        box = f"{boxes[key].low:g} to {boxes[key].high:g}"
+        lines.append(f"{key} = {values[key]:.4g} is at the {end} edge of {box}")
+    return tuple(lines)
 
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:
     """Write the file atomically."""
     values = asdict(tuned)
     records = values.pop("studies")
-    text = HEADING + _table(values if records else {**values, "studies": ()})
-    text += "".join(_table(record, "studies.", "\n[[studies]]\n") for record in records)
+    if not records:
+        values["studies"] = ()
+    text = HEADING + _table(values)
+    for record in records:
+        text += _table(record, "studies.", "\n[[studies]]\n")
     write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
     """Return a table in TOML, those in it after its own values; `before` stands before their names."""
-    nested = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    lines = "".join(
-        f"{key} = {toml(value)}\n" for key, value in values.items() if key not in nested
-    )
-    tables = (
-        _table(value, f"{before}{key}.", f"\n[{before}{key}]\n") for key, value in nested.items()
-    )
-    return heading * bool(lines or not nested) + lines + "".join(tables)
+    lines = ""
+    tables = ""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            name = f"{before}{key}"
+            tables += _table(value, f"{name}.", f"\n[{name}]\n")
+        else:
+            lines += f"{key} = {toml(value)}\n"
+    if tables and not lines:  # TOML needs no heading of a table that only holds tables
+        return tables
+    return heading + lines + tables
 
 
 @dataclass(frozen=True)
@@ -352,14 +374,15 @@ class Check:
             config = default_config(find_tunable(name))
             Trial(name, config).build(runs.runs())
             ledger = open_ledger(folder, name, runs, SECOND)
-            space, values = find_space(name), values_of(name, config)
-            for key, other in neighbours(space, values):
-                both = [nested_settings(values), nested_settings(other)]
-                if both[0] != both[1]:
-                    self._changes.append(
-                        (ledger, both, partial(Change, name, key, values[key], other[key]))
-                    )
-                    points |= {f"{name}{each}": (ledger, name, each) for each in both}
+            values = values_of(name, config)
+            before = nested_settings(values)
+            for key, other in neighbours(find_space(name), values):
+                after = nested_settings(other)
+                if before != after:
+                    change = partial(Change, name, key, values[key], other[key])
+                    self._changes.append((ledger, [before, after], change))
+                    points[f"{name}{before}"] = (ledger, name, before)
+                    points[f"{name}{after}"] = (ledger, name, after)
         self._points = list(points.values())
 
     def __len__(self) -> int:
@@ -376,19 +399,16 @@ class Check:
 
     def changes(self) -> list[Change]:
         """Return every change whose scores are known."""
-        known = [
-            (change, ledger.costs(both[0]), ledger.costs(both[1]))
-            for ledger, both, change in self._changes
-        ]
-        return [
-            change(score(before), score(after))
-            for change, before, after in known
-            if before and after
-        ]
+        known = []
+        for ledger, (before, after), change in self._changes:
+            costs_before = ledger.costs(before)
+            costs_after = ledger.costs(after)
+            if costs_before and costs_after:
+                known.append(change(score(costs_before), score(costs_after)))
+        return known
 
 
 def improvements(changes: Sequence[Change]) -> list[Change]:
     """Return the changes that gain more than the tolerance, the largest first."""
-    return sorted(
-        (change for change in changes if change.gain > TOLERANCE), key=lambda change: -change.gain
-    )
+    found = [change for change in changes if change.gain > TOLERANCE]
+    return sorted(found, key=lambda change: -change.gain)

@@ -58,7 +58,8 @@ TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
     "circle": {"radius": 0.17, "lap_time": 5.0},  # at 0.21 m/s, the whole task at 0.19 m/s
     "lemniscate": {"radius": 0.14, "lap_time": 5.0},
 }
-_LEAVING: Final[Varied] = (  # the networks' box by 0.5 rad each way
+# Starts leave the networks' box by 0.5 rad each way.
+_LEAVING: Final[Varied] = (
     ("task.lower", tuple(low - 0.5 for low in TRAINING_LOWER)),
     ("task.upper", tuple(high + 0.5 for high in TRAINING_UPPER)),
 )
@@ -100,18 +101,21 @@ MODELS: Final = (
     "moderate+gear_ratio=50%",
 )
 """The mismatch of a robot."""
-WEIGHTS: Final[Mapping[str, float]] = {
-    task: len(KINDS) / 2 / sum((task == MOVE) == (other == MOVE) for other, _ in KINDS)
-    for task, _ in KINDS
-}
-FLOOR: Final = (
-    0.0015  # [m] error below which nothing is gained; that of `log_error` where the band is 5 mm
-)
+
+
+def _weight(task: str) -> float:
+    """Return the weight of a task: half of the worlds over those with a task of its kind, a move or a curve."""
+    alike = sum((task == MOVE) == (other == MOVE) for other, _ in KINDS)
+    return len(KINDS) / 2 / alike
+
+
+WEIGHTS: Final[Mapping[str, float]] = {task: _weight(task) for task, _ in KINDS}
+# An error below the floor gains nothing; it is that of `log_error` where the settling band is 5 mm.
+FLOOR: Final = 0.0015  # [m]
 DECADES: Final = math.log10(1.0 / FLOOR)  # from the floor to 1 m
-WORST: Final = 1.0  # cost of a run that did not complete, and most of any run
-MIN_DELAY_MARGIN: Final = (
-    0.05  # [s] of the loop at the usual latency; settings with less are refused without a run
-)
+WORST: Final = 1.0  # cost of a run that did not complete, and the greatest of any run
+# Settings whose loop has a smaller delay margin at the usual latency are refused without a run.
+MIN_DELAY_MARGIN: Final = 0.05  # [s]
 # Where in the tuning range the seeds of the second sets begin
 SECOND_OFFSET: Final = len(TUNING) // 2
 SECOND_FACTOR: Final = 3  # robots of the second set for each of the first
@@ -135,9 +139,8 @@ class TuningSet:
             raise ValueError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
             entry = find_plant(name)
-            if entry.own_robot or not isinstance(
-                getattr(entry.config(), "sensing", None), SensingConfig
-            ):
+            sensing = getattr(entry.config(), "sensing", None)
+            if entry.own_robot or not isinstance(sensing, SensingConfig):
                 raise ValueError(
                     f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency"
                 )
@@ -148,9 +151,12 @@ class TuningSet:
         Raises:
             ValueError: the range has not that many beside those of this set.
         """
-        own, count = len(KINDS) * self.robots, len(KINDS) * SECOND_FACTOR * self.robots
+        own = len(KINDS) * self.robots
+        count = len(KINDS) * SECOND_FACTOR * self.robots
         offset = (self.offset + SECOND_OFFSET) % len(TUNING)
-        room = (self.offset if offset < self.offset else len(TUNING)) - offset
+        # The second set ends at the range's end or, where it begins before this set, at this set.
+        end = self.offset if offset < self.offset else len(TUNING)
+        room = end - offset
         if count > room or self.offset + own > offset > self.offset:
             raise ValueError(
                 f"the tuning range of {len(TUNING)} has no room for {own} seeds from {self.offset} on, of the trials, "
@@ -161,29 +167,22 @@ class TuningSet:
     def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a world one after the other."""
         count = len(KINDS) * self.robots
-        seeds, models = tuning_seeds(count, self.offset), self._drawn("model", MODELS, count)
+        seeds = tuning_seeds(count, self.offset)
+        models = self._drawn("model", MODELS, count)
         level = {name: self._drawn(name, levels, len(KINDS)) for name, levels in LEVELS.items()}
         runs = []
         for plant in self.plants:
-            # Rendered drives have no setting for their overshoot
             known = flatten(find_plant(plant).config())
-            drives = [
-                [pair for pair in drive if pair[0].partition(".")[2] in known]
-                for drive in level["drive"]
-            ]
             for run, (seed, model) in enumerate(zip(seeds, models, strict=True)):
                 world = run // self.robots
                 task, varied = KINDS[world]
-                own = (
-                    *varied,
-                    *drives[world],
-                    *((key, level[key][world]) for key in ("noise", "latency")),
-                )
-                runs.append(
-                    RunRequest(
-                        plant, "", task, read_mismatch(model + level["detector"][world]), seed, own
-                    )
-                )
+                # Rendered drives have no setting for their overshoot.
+                drive = [pair for pair in level["drive"][world] if _setting(pair[0]) in known]
+                noise = ("noise", level["noise"][world])
+                latency = ("latency", level["latency"][world])
+                own = (*varied, *drive, noise, latency)
+                mismatch = read_mismatch(model + level["detector"][world])
+                runs.append(RunRequest(plant, "", task, mismatch, seed, own))
         return runs
 
     def _drawn(self, name: str, levels: Sequence[Any], count: int) -> list[Any]:
@@ -194,13 +193,13 @@ class TuningSet:
     def checked(self) -> list[int]:
         """Return the indices of a subset small enough for a test: two robots on moves, two on a circle."""
         curve = next(world for world, (task, _) in enumerate(KINDS) if task != MOVE)
-        return sorted(
-            {
-                world * self.robots + robot
-                for world in (0, curve)
-                for robot in range(min(2, self.robots))
-            }
-        )
+        robots = range(min(2, self.robots))
+        return [world * self.robots + robot for world in (0, curve) for robot in robots]
+
+
+def _setting(key: str) -> str:
+    """Return the name of a setting without its section."""
+    return key.partition(".")[2]
 
 
 @dataclass(frozen=True)
@@ -214,9 +213,8 @@ class Trial:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
         given = Settings(TASKS)
-        sections = Sections(
-            resolve_sections(requests, given) | {self.controller: self.config}, given, {}
-        )
+        resolved = resolve_sections(requests, given) | {self.controller: self.config}
+        sections = Sections(resolved, given, {})
         return [select(request, sections) for request in requests]
 
     def build(self, runs: Sequence[RunRequest]) -> None:
@@ -233,11 +231,9 @@ def run_cost(task: str, row: Mapping[str, Any]) -> float:
     weight = WEIGHTS[task]
     if row["status"] != COMPLETED:
         return weight * WORST
-    decades = (
-        float(row["log_error"])
-        if task == MOVE
-        else math.log10(max(row["rms_error_evaluated"] / FLOOR, 1.0))
-    )
+    if task == MOVE:
+        return weight * min(float(row["log_error"]) / DECADES, WORST)
+    decades = math.log10(max(row["rms_error_evaluated"] / FLOOR, 1.0))
     return weight * min(decades / DECADES, WORST)
 
 
@@ -254,7 +250,7 @@ def evaluate(
     Args:
         trials: the trials to score.
         runs: the runs of each.
-        workers: where.
+        workers: the processes that carry them out.
 
     Raises:
         ConfigurationError: the worker processes cannot be started.
@@ -263,20 +259,21 @@ def evaluate(
     for t, trial in enumerate(trials):
         for r, run in enumerate(trial.resolved(runs)):
             kinds.setdefault(side_by_side_key(run), []).append((t, r, run))
-    order = [(kind, *each) for kind, same in kinds.items() for each in same]
-    jobs = [
-        Job(index, Cell(run.request), run, kind) for index, (kind, _, _, run) in enumerate(order)
-    ]
+    jobs: list[Job] = []
+    places: list[tuple[int, int]] = []  # indices of trial and run by the number of the job
+    for kind, alike in kinds.items():
+        for t, r, run in alike:
+            jobs.append(Job(len(jobs), Cell(run.request), run, kind))
+            places.append((t, r))
     own = offered(dict.fromkeys(run.plant for run in runs))
-    for block, outcome in carry_out_blocks(
-        cut(jobs, even_size(len(jobs), workers.count), 1, own), workers
-    ):
+    blocks = cut(jobs, even_size(len(jobs), workers.count), 1, own)
+    for block, outcome in carry_out_blocks(blocks, workers):
         for job, result in zip(block.jobs, outcome, strict=True):
-            _, t, r, _ = order[job.index]
+            t, r = places[job.index]
             yield t, r, run_cost(runs[r].task, result.row)
 
 
-SECOND: Final = ".second"  # of the name of the ledger of the second set
+SECOND: Final = ".second"  # in the name of the ledger of the second set
 Wanted: TypeAlias = tuple["Ledger", str, Mapping[str, Any]]
 """A point whose costs are wanted: the ledger that takes them, the controller, its nested settings."""
 LEDGER: Final = ".jsonl"
@@ -307,14 +304,13 @@ class Ledger:
         with configuration_errors(f"study {self.path} cannot be opened: ", *wrong):
             content = self.path.read_bytes()
             self._size = content.rfind(b"\n") + 1
-            header, *records = [
-                json.loads(line) for line in content[: self._size].splitlines()
-            ] or [self._fingerprint]
+            lines = [json.loads(line) for line in content[: self._size].splitlines()]
+            header, *records = lines or [self._fingerprint]
             self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
         known = header if isinstance(header, dict) else {}
-        if parts := ", ".join(
-            key for key, value in self._fingerprint.items() if known.get(key) != value
-        ):
+        others = [key for key, value in self._fingerprint.items() if known.get(key) != value]
+        if others:
+            parts = ", ".join(others)
             raise ConfigurationError(
                 f"study {self.path} was made with other {parts}; name another folder with --out"
             )
@@ -329,12 +325,13 @@ class Ledger:
 
     def add(self, settings: Mapping[str, Any], costs: Sequence[float]) -> None:
         """Write the costs of the runs under nested settings down."""
-        lines = [self._fingerprint] * (not self._size) + [
-            {"settings": settings, "costs": list(costs)}
-        ]
+        record = {"settings": settings, "costs": list(costs)}
+        text = f"{json.dumps(record)}\n"
+        if self._size == 0:
+            text = f"{json.dumps(self._fingerprint)}\n{text}"
         with accessing(self.path, "study"), self.path.open("ab") as file:
-            file.truncate(self._size)
-            file.write("".join(f"{json.dumps(line)}\n" for line in lines).encode())
+            file.truncate(self._size)  # half a line of a killed process goes
+            file.write(text.encode())
             file.flush()
             os.fsync(file.fileno())
             self._size = file.tell()
@@ -343,13 +340,10 @@ class Ledger:
 
 def _costs(given: object) -> list[float]:
     """Return the costs of a record; a ValueError if they are no numbers."""
-    if (
-        not isinstance(given, list)
-        or not given
-        or not all(type(each) in (int, float) for each in given)
-    ):
+    numbers = given if isinstance(given, list) else []
+    if not numbers or not all(type(each) in (int, float) for each in numbers):
         raise ValueError(f"costs must be a list of numbers, got {str(given)[:SHOWN]}")
-    return [float(each) for each in given]
+    return [float(each) for each in numbers]
 
 
 def _key(settings: Mapping[str, Any]) -> str:
@@ -362,22 +356,32 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
     Raises:
         ConfigurationError: the file is no ledger, or one of other settings or runs.
     """
-    constants = {
-        "KINDS": KINDS, "LEVELS": LEVELS, "MODELS": MODELS, "TASKS": TASKS, "FLOOR": FLOOR,
-        "MIN_DELAY_MARGIN": MIN_DELAY_MARGIN, "WORST": WORST,
-    }  # fmt: skip
+    objective = {
+        "KINDS": KINDS,
+        "LEVELS": LEVELS,
+        "MODELS": MODELS,
+        "TASKS": TASKS,
+        "FLOOR": FLOOR,
+        "MIN_DELAY_MARGIN": MIN_DELAY_MARGIN,
+        "WORST": WORST,
+    }
     plants = Survey(plants=dict.fromkeys(runs.plants))
     files = named_files(plants, {}, offered(runs.plants))
+    code = [each["sha256"] for _, each in plugins(plants)]
+    defaults = find_tunable(controller).config()
     fingerprint = {
-        "defaults": {
-            key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()
-        },
-        "objective": {name: repr(value) for name, value in constants.items()},
-        "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
-        "plants": [*runs.plants, *files.values(), *(each["sha256"] for _, each in plugins(plants))],
+        "defaults": _written(flatten(defaults)),
+        "objective": _written(objective),
+        "run settings": _written(asdict(RunSettings())),
+        "plants": [*runs.plants, *files.values(), *code],
         "robots": [runs.robots, runs.offset],
     }
     return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint)
+
+
+def _written(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return values as texts that tell any two of them apart."""
+    return {key: repr(value) for key, value in values.items()}
 
 
 def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
@@ -402,10 +406,9 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
         else:
             lacking[f"{name}{nested}"] = ledger, trial, nested
     points = list(lacking.values())
+    trials = [trial for _, trial, _ in points]
     costs = np.full((len(points), len(requests)), np.nan)
-    for point_index, run_index, cost in evaluate(
-        [trial for _, trial, _ in points], requests, workers
-    ):
+    for point_index, run_index, cost in evaluate(trials, requests, workers):
         costs[point_index, run_index] = cost
         if not np.isnan(costs[point_index]).any():
             ledger, trial, nested = points[point_index]
