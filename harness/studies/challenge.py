@@ -29,7 +29,7 @@ from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.config.source import find_place
 from servobench.harness.run.experiment import draw
-from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, with_camera
+from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, with_camera
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.tasks import choose_task
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -55,10 +55,10 @@ FOLDER: Final = files("servobench.harness.studies") / "challenges"
 class Measure(NamedTuple):
     """The measure of a challenge."""
 
-    column: str  # of the table of runs; less is better
-    floor: float  # below which a difference does not count [unit of the column, m for positions]
+    column: str  # column of the table of runs; less is better
+    floor: float  # value below which a difference does not count [unit of the column]
     factor: float  # from the column to the unit in which it is shown
-    unit: str  # in which it is shown
+    unit: str  # unit in which it is shown
     achieved: str  # the word for a run that is not lost
 
 
@@ -112,25 +112,22 @@ class Challenge:
             seeds: of the robots.
             bounded: number of robots on which the references run; None for that of the file.
         """
-        short = {
-            name: getattr(self, name) for name in SHORT_NAMES if getattr(self, name) is not None
-        }
+        given = {name: getattr(self, name) for name in SHORT_NAMES}
+        short = {name: value for name, value in given.items() if value is not None}
         varied = tuple((short | flatten(self.settings)).items())
-        methods = tuple(name for name in controllers if name not in self.reference)
-        robots = {methods: seeds, self.reference: seeds[: bounded or self.reference_seeds]}
-        arm = with_camera(DEFAULT_ROBOT, Path(self.camera)) if self.camera else DEFAULT_ROBOT
+        robot = with_camera(DEFAULT_ROBOT, Path(self.camera)) if self.camera else DEFAULT_ROBOT
         world = partial(
             Batch,
             tuple(plants) or self.plants,
             tasks=(self.task,),
             mismatches=(self.mismatch,),
-            robot=arm,
+            robot=robot,
         )
-        requests = (
-            request
-            for names, own in robots.items()
-            for request in world(names, seeds=own).requests()
-        )
+        methods = tuple(name for name in controllers if name not in self.reference)
+        seeds_by_names = {methods: seeds, self.reference: seeds[: bounded or self.reference_seeds]}
+        requests: list[RunRequest] = []
+        for names, own in seeds_by_names.items():
+            requests += world(names, seeds=own).requests()
         return [Cell(replace(request, varied=varied)) for request in requests]
 
     def check(self) -> None:
@@ -152,13 +149,13 @@ class Challenge:
                 raise ValueError(
                     f"settings: {key} must begin with one of {', '.join(OWN_SECTIONS)}"
                 )
-        run = resolve(self.cells((), (), [0])[0].request, Settings())
+        first = self.cells((), (), [0])[0]
+        run = resolve(first.request, Settings())
         own_robot = find_plant(run.request.plant).own_robot
-        if (
-            self.measure == "settling"
-            and not own_robot
-            and draw(run).scenario.kind != "point_to_point"
-        ):
+        # A plant with a robot of its own draws no scenario here.
+        if self.measure != "settling" or own_robot:
+            return
+        if draw(run).scenario.kind != "point_to_point":
             raise ValueError(
                 f"measure settling is for moves, and {self.task} is a curve; wanted path"
             )
@@ -166,9 +163,8 @@ class Challenge:
 
 def challenge_names() -> list[str]:
     """Return the names of the challenges of this package."""
-    return sorted(
-        file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX)
-    )
+    names = [file.name for file in FOLDER.iterdir()]
+    return sorted(name.removesuffix(SUFFIX) for name in names if name.endswith(SUFFIX))
 
 
 def choose_challenges(words: Sequence[str], grades: Sequence[str]) -> list[Challenge]:
@@ -210,12 +206,14 @@ def find_challenge(word: str) -> Challenge:
     values = read_toml("challenge", path)
     with configuration_errors(f"{path}: "):
         challenge = override("challenge", Challenge(path.stem), values)
-        task, given = challenge.task, flatten(challenge.settings)
+        task = challenge.task
         if (place := find_place(task)) and place["file"]:
             before = place.string[: place.start("file")]
             behind = place.string[place.end("file") :]
             task = f"{before}{_seen(path, place['file'])}{behind}"
-        given |= {key: _seen(path, given[key]) for key in ("task.file",) if key in given}
+        given = flatten(challenge.settings)
+        if "task.file" in given:
+            given["task.file"] = _seen(path, given["task.file"])
         camera = _seen(path, challenge.camera) if challenge.camera else ""
         challenge = replace(challenge, task=choose_task(task), camera=camera, settings=given)
         challenge.check()

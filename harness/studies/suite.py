@@ -38,7 +38,10 @@ from servobench.plant.contract.files import write_csv
 
 MAX_REFERENCE_LOSS: Final = 0.05
 SEEING: Final = "nmpc_calibrated"  # reference that sees the images of all methods
-RUNS, METHODS, RANKING, PICTURE = "scores.csv", "methods.csv", "ranking.csv", "suite"
+RUNS: Final = "scores.csv"
+METHODS: Final = "methods.csv"
+RANKING: Final = "ranking.csv"
+PICTURE: Final = "suite"
 FACTORS: Final = (1.1, 2.0, 10.0)  # times the best method of a run, of the profile in the table
 DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())
 
@@ -63,9 +66,8 @@ def carry_out_suite(
         ConfigurationError: settings that nothing reads or that a challenge fixes, or as `carry_out_parts`.
     """
     requests = [run.request for own in runs.values() for run in own]
-    check_settings(
-        settings, [name for each in requests for name in (each.plant, each.controller, each.task)]
-    )
+    names = [name for each in requests for name in (each.plant, each.controller, each.task)]
+    check_settings(settings, names)
     for cells in runs.values():
         check_effects(settings, [cell.request for cell in cells], steps=False)
     seeing = {SEEING: {"image": True, **settings.sections.get(SEEING, {})}}
@@ -74,15 +76,19 @@ def carry_out_suite(
     for request in requests:
         select(request, sections)  # all challenges are checked before the first one runs
     tables = carry_out_parts({name: Campaign(own, whole) for name, own in runs.items()}, out, how)
-    judged = pd.concat(
-        [judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True
-    )
+    parts = [judge(challenge, tables[challenge.name]) for challenge in challenges]
+    judged = pd.concat(parts, ignore_index=True)
     write_csv(judged, out / RUNS)
-    for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):
-        write_csv(pd.json_normalize(as_plain(rows)), out / name)
+    _write_rows(methods_rows(judged), out / METHODS)
+    _write_rows(ranking_rows(judged), out / RANKING)
     for _, own in bounded(judged).groupby("plant", sort=False):
         draw_suite(own, out)
     return judged
+
+
+def _write_rows(rows: list[Row], path: Path) -> None:
+    """Write rows as plain values, an estimate in a column for each of its numbers."""
+    write_csv(pd.json_normalize(as_plain(rows)), path)
 
 
 def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
@@ -94,18 +100,24 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
         `reference`, the value of the better one, NaN where it is lost.
     """
     measure = MEASURES[challenge.measure]
+    floor = measure.factor * measure.floor
     measured = measure.factor * column_of(runs, measure.column).where(runs["status"] == COMPLETED)
-    value = measured.where(outcomes(runs).isin(ACHIEVED)).clip(lower=measure.factor * measure.floor)
+    value = measured.where(outcomes(runs).isin(ACHIEVED)).clip(lower=floor)
     robots = pd.MultiIndex.from_frame(runs[["plant", "seed"]])
     is_reference = runs["controller"].isin(challenge.reference)
     best = value[is_reference].groupby([runs["plant"], runs["seed"]]).min()
     reference = best.reindex(robots).to_numpy()
-    known = robots.isin(best.index)
+    has_reference = robots.isin(best.index)
     return runs[["plant", "controller", "seed"]].assign(
-        challenge=challenge.name, title=challenge.title, grade=challenge.grade.name, measure=challenge.measure,
-        measured=measured, value=value, reference=reference,
-        score=np.where(known, scores(value, reference, measure.factor * measure.floor), np.nan),
-    )  # fmt: skip
+        challenge=challenge.name,
+        title=challenge.title,
+        grade=challenge.grade.name,
+        measure=challenge.measure,
+        measured=measured,
+        value=value,
+        reference=reference,
+        score=np.where(has_reference, scores(value, reference, floor), np.nan),
+    )
 
 
 def bounded(judged: pd.DataFrame) -> pd.DataFrame:
@@ -125,25 +137,27 @@ def methods_rows(judged: pd.DataFrame) -> list[Row]:
     rows = []
     for _, place in judged.groupby(["challenge", "plant"], sort=False):
         best = place[place["score"].notna()].drop_duplicates("seed")["reference"]
+        facts = place.iloc[0]
         about = {
-            name: Cell(str(place[name].iloc[0]))
-            for name in ("challenge", "grade", "plant", "measure")
+            name: Cell(str(facts[name])) for name in ("challenge", "grade", "plant", "measure")
         }
         about["reference"] = Cell(median_with_interval(best).value, ".2f")
         about["reference_lost"] = Cell(100.0 * float(best.isna().mean()), ".1f")
-        means = (
-            place.groupby("controller", sort=False)["score"]
-            .mean()
-            .sort_values(ascending=False, kind="stable")
-        )
-        for name, score in means.items():
+        means = place.groupby("controller", sort=False)["score"].mean()
+        for name, score in means.sort_values(ascending=False, kind="stable").items():
             own = place[place["controller"] == name]
-            good = success_rate(int(own["value"].notna().sum()), len(own)).scaled(100.0)
-            rows.append(
-                {**about, "controller": Cell(str(name)), "runs": Cell(float(len(own)), ".0f"),
-                 "good": Cell(good, ".0f"), "median": Cell(median_with_interval(own["measured"]), ".2f"),
-                 "lost": Cell(100.0 - good.value, ".0f"), "score": Cell(float(score), ".2f")}
-            )  # fmt: skip
+            count = int(own["value"].notna().sum())
+            good = success_rate(count, len(own)).scaled(100.0)
+            row = {
+                **about,
+                "controller": Cell(str(name)),
+                "runs": Cell(float(len(own)), ".0f"),
+                "good": Cell(good, ".0f"),
+                "median": Cell(median_with_interval(own["measured"]), ".2f"),
+                "lost": Cell(100.0 - good.value, ".0f"),
+                "score": Cell(float(score), ".2f"),
+            }
+            rows.append(row)
     return rows
 
 
@@ -157,12 +171,12 @@ def ranking_rows(judged: pd.DataFrame) -> list[Row]:
                 "plant": Cell(str(plant)),
                 "controller": Cell(each.controller),
                 "rank": Cell(each.rank),
+                "score": Cell(each.score, ".2f"),
+                "lost, %": Cell(100.0 * each.lost, ".1f"),
             }
-            row |= {"score": Cell(each.score, ".2f"), "lost, %": Cell(100.0 * each.lost, ".1f")}
-            within = zip(FACTORS, shares[each.controller], strict=True)
-            rows.append(
-                row | {f"within {factor:g}×": Cell(float(share), ".2f") for factor, share in within}
-            )
+            for factor, share in zip(FACTORS, shares[each.controller], strict=True):
+                row[f"within {factor:g}×"] = Cell(float(share), ".2f")
+            rows.append(row)
     return rows
 
 
@@ -171,23 +185,29 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     titles = dict(zip(judged["challenge"], judged["title"], strict=True))
     rows = as_text(methods_rows(judged))
     for (name, plant), place in rows.groupby(["challenge", "plant"], sort=False):
-        about, measure = place.iloc[0], MEASURES[place["measure"].iloc[0]]
-        scored = judged[
-            (judged["challenge"] == name) & (judged["plant"] == plant) & judged["score"].notna()
-        ]
-        fails = len(scored) > 0 and bounded(scored).empty
-        grade = "no grade, as its references fail" if fails else about["grade"] or "ungraded"
+        about = place.iloc[0]
+        measure = MEASURES[about["measure"]]
+        is_here = (judged["challenge"] == name) & (judged["plant"] == plant)
+        scored = judged[is_here & judged["score"].notna()]
+        grade = about["grade"] or "ungraded"
+        if len(scored) > 0 and bounded(scored).empty:
+            grade = "no grade, as its references fail"
         bound = f"reference {about['reference']} {measure.unit}, lost {about['reference_lost']} %"
-        heads = {"controller": "controller", "runs": "runs", "good": f"{measure.achieved}, %",
-                 "median": f"median, {measure.unit}", "lost": "lost, %", "score": "score"}  # fmt: skip
-        yield (
-            f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}",
-            place[list(heads)].rename(columns=heads),
-        )
+        headings = {
+            "controller": "controller",
+            "runs": "runs",
+            "good": f"{measure.achieved}, %",
+            "median": f"median, {measure.unit}",
+            "lost": "lost, %",
+            "score": "score",
+        }
+        title = f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}"
+        yield title, place[list(headings)].rename(columns=headings)
     if ranks := ranking_rows(judged):
+        count = rows["challenge"].nunique()
         for plant, place in as_text(ranks).groupby("plant", sort=False):
             own = bounded(judged[judged["plant"] == plant])
-            title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
+            title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {count}"
             if own.groupby("challenge")["seed"].nunique().min() > 1:
                 apart = f"{resolution(own):.3f}".replace("0.000", "less than 0.001")
                 title += f"; halves of the robots differ by {apart} in the score"
@@ -199,34 +219,31 @@ def draw_suite(runs: pd.DataFrame, folder: Path) -> list[Path]:
 
     Args:
         runs: bounded judged runs of one plant.
-        folder: of the files, which the plant names.
+        folder: folder of the files, which the plant names.
     """
     means = runs.pivot_table("score", "controller", "challenge", sort=False)
     means = means.loc[[each.controller for each in ranking(runs)]]
-    shares, styles = profile(runs, DRAWN_FACTORS), style.method_styles(means.index)
+    shares = profile(runs, DRAWN_FACTORS)
+    styles = style.method_styles(means.index)
+    plant = runs["plant"].iloc[0]
     with style.figure_style(style.TEXT):
         heights = (2.2, 0.9 + 0.19 * len(means))
         figure = Figure(figsize=(style.WIDTH, sum(heights) + 0.9), layout="constrained")
         top, bottom = figure.subplots(2, 1, height_ratios=heights)
         for name in means.index:
-            top.plot(
-                shares.index, shares[name], label=name, **styles[name].line_arguments(len(shares))
-            )
+            look = styles[name].line_arguments(len(shares))
+            top.plot(shares.index, shares[name], label=name, **look)
         style.plain_logarithms(top, "x")
         top.set(xlabel="times the best method of the run", ylabel="share of runs", ylim=(0.0, 1.02))
-        top.set_title(
-            f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}"
-        )
+        top.set_title(f"Runs within a factor of the best, and mean scores, on {plant}")
         _draw_scores(bottom, means)
         style.add_legend(figure, [top])
-    return style.save_figure(
-        figure, folder / UNFIT_FOR_FILES.sub("_", f"{PICTURE}_{runs['plant'].iloc[0]}")
-    )
+    return style.save_figure(figure, folder / UNFIT_FOR_FILES.sub("_", f"{PICTURE}_{plant}"))
 
 
 def _draw_scores(axes: Axes, means: pd.DataFrame) -> None:
     """Draw a cell for each method and challenge; dark is good."""
-    # So that text is readable on every cell
+    # The scale ends beyond 1, so that dark text is readable on every cell.
     axes.imshow(means, cmap="Blues", vmin=0.0, vmax=1.3, aspect="auto")
     for (row, column), score in np.ndenumerate(means.to_numpy()):
         axes.text(column, row, f"{score:.2f}", ha="center", va="center", fontsize=style.TEXT - 2.0)

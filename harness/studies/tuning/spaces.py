@@ -48,7 +48,7 @@ Space: TypeAlias = Mapping[str, Distribution]
 Point: TypeAlias = Mapping[str, Any]
 """A value for each key of a space."""
 
-DIGITS: Final = 3  # of a tuned number: more would pretend to a precision that no study has
+DIGITS: Final = 3  # significant digits of a tuned number; no study is more precise
 EDGE: Final = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
 WIDER: Final = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
 LIMITS: Final[Mapping[str, float]] = {
@@ -213,7 +213,8 @@ def widened(space: Space, values: Point) -> Space:
     wider = dict(space)
     for key, end in edges(space, values).items():
         box: Any = space[key]
-        low, high = min(box.low, values[key]), max(box.high, values[key])
+        low = min(box.low, values[key])
+        high = max(box.high, values[key])
         if end == "upper":
             high = min(high * WIDER if box.log else 2 * high - low, LIMITS.get(key, math.inf))
         else:
@@ -260,16 +261,14 @@ class Found(NamedTuple):
 class StudyRecord:
     """The result of a study, as files of tuned values hold it."""
 
-    seed: int  # of the sampler
-    trials: int  # of the sampler, the first points included
+    seed: int  # seed of the sampler
+    trials: int  # trials of the sampler, the first points included
     best_trial: int  # the number of the best one; 0 is that of the defaults
     best_trial_score: float
     search_points: int  # scored by the coordinate search that began there
-    search_complete: (
-        bool  # whether no change of one value improves the score; False: its budget ended first
-    )
-    score: float  # at its end
-    second_score: float  # of the same settings on the second set; NaN until they are scored there
+    search_complete: bool  # whether no change of one value helps; False: its budget ended first
+    score: float  # score at its end
+    second_score: float  # score on the second set; NaN until the settings are scored there
     settings: Mapping[str, Any]  # nested values
 
 
@@ -288,29 +287,33 @@ def study(
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sampled = optuna.create_study(direction="minimize")
-    tried: list[tuple[float, Point]] = []
+    scores: list[float] = []
+    points: list[Point] = []
     for number in range(trials):
         if number < len(first):
             sampled.enqueue_trial(dict(first[number]))
+        own_seed = named_seed(seed, f"{name}, trial {number}")
         with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
-            sampled.sampler = TPESampler(
-                seed=named_seed(seed, f"{name}, trial {number}"), multivariate=True
-            )
+            sampled.sampler = TPESampler(seed=own_seed, multivariate=True)
         with np.errstate(all="ignore"):  # the sampler's densities may underflow
             trial = sampled.ask(dict(space))
         score = yield trial.params
-        tried.append((score, trial.params))
+        scores.append(score)
+        points.append(trial.params)
         sampled.tell(trial, score)
-    best = min(range(trials), key=lambda number: tried[number][0])
-    found = yield from coordinate_search(space, tried[best][1], tried[best][0], search)
-    search_end = (
-        found.evaluations,
-        found.complete,
-        found.score,
-        math.nan,
-        nested_settings(found.values),
+    best = scores.index(min(scores))
+    found = yield from coordinate_search(space, points[best], scores[best], search)
+    return StudyRecord(
+        seed=seed,
+        trials=trials,
+        best_trial=best,
+        best_trial_score=scores[best],
+        search_points=found.evaluations,
+        search_complete=found.complete,
+        score=found.score,
+        second_score=math.nan,
+        settings=nested_settings(found.values),
     )
-    return StudyRecord(seed, trials, best, tried[best][0], *search_end)
 
 
 def coordinate_search(
@@ -359,7 +362,9 @@ def _step(distribution: FloatDistribution | IntDistribution, value: float, sign:
     if distribution.step is not None:
         size = distribution.step * max(1, round(size / distribution.step))
     moved = min(max(value + sign * size, distribution.low), distribution.high)
-    return int(moved) if isinstance(distribution, IntDistribution) else moved
+    if isinstance(distribution, IntDistribution):
+        return int(moved)
+    return moved
 
 
 def neighbours(space: Space, values: Point) -> list[tuple[str, Point]]:
@@ -375,14 +380,15 @@ def first_points(name: str) -> list[Point]:
     They are the defaults of its class, the tuned values in use, the defaults with each value of each switch, and the
     tuned values with those of other methods for the keys that both have.
     """
-    entry, space = find_tunable(name), find_space(name)
-    default, own = default_values(entry), tuned_point(entry)
+    entry = find_tunable(name)
+    space = find_space(name)
+    default = default_values(entry)
+    own = tuned_point(entry)
     flips = [point for _, point in neighbours(_switches(space), default)]
     points = [default, own, *flips]
     for other in SPACES:
-        shared = {
-            key: value for key, value in flatten(tuned_settings(other)).items() if key in space
-        }
+        tuned = flatten(tuned_settings(other))
+        shared = {key: value for key, value in tuned.items() if key in space}
         if shared and other != name:
             points.append(inside(space, {**own, **shared}, own))
     return list({str(nested_settings(point)): point for point in points}.values())
@@ -390,12 +396,15 @@ def first_points(name: str) -> list[Point]:
 
 def tuned_point(entry: ControllerEntry) -> Point:
     """Return the tuned values in use as a point of the controller's space; the defaults if there are none that fit."""
-    default, settings = default_values(entry), tuned_settings(entry.name)
+    default = default_values(entry)
+    settings = tuned_settings(entry.name)
+    if not settings:
+        return default
     try:
         values = values_of(entry.name, apply_settings(entry, settings))
     except ConfigurationError:
         return default  # a file of an earlier version
-    return inside(find_space(entry.name), values, default) if settings else default
+    return inside(find_space(entry.name), values, default)
 
 
 def inside(space: Space, values: Point, otherwise: Point) -> Point:
@@ -409,7 +418,5 @@ def _within(distribution: Distribution, value: Any, otherwise: Any) -> Any:  # n
     within = min(max(value, distribution.low), distribution.high)
     if distribution.step is None:
         return within
-    return type(within)(
-        distribution.low
-        + distribution.step * round((within - distribution.low) / distribution.step)
-    )
+    steps = round((within - distribution.low) / distribution.step)
+    return type(within)(distribution.low + distribution.step * steps)
