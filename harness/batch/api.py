@@ -16,6 +16,7 @@ import pandas as pd
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
+from servobench.harness.batch.isolation import GUARD, START_ERROR
 from servobench.harness.batch.plan import (
     MAX_SEEDS,
     Batch,
@@ -25,7 +26,6 @@ from servobench.harness.batch.plan import (
     refuse_tuning_seeds,
 )
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.sandbox import GUARD, START_ERROR
 from servobench.harness.config.registry import (
     can_travel,
     choose_controller,

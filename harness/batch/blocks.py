@@ -1,4 +1,4 @@
-"""The lower half of the driver: blocks of runs, carried out in this process, in sandboxes or by an executor of others.
+"""The lower half of the driver: blocks of runs, carried out here, in isolated processes or by an executor of others.
 
 The runs of a block advance together, one control period after the other, where they are alike enough for that; all
 others go one by one. A run has the same row either way, but for the times of its steps, which only a run that goes by
@@ -35,9 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.batch.plan import Cell
-from servobench.harness.batch.processes import Bounds, Limits, available_processors, can_watch
-from servobench.harness.batch.sandbox import (
+from servobench.harness.batch.isolation import (
     SILENT,
     TALKATIVE,
     Answer,
@@ -47,6 +45,8 @@ from servobench.harness.batch.sandbox import (
     Tell,
     Workers,
 )
+from servobench.harness.batch.plan import Cell
+from servobench.harness.batch.processes import Bounds, Limits, available_processors, can_watch
 from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile, check_present_folder
 from servobench.harness.run import episode

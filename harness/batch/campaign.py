@@ -32,11 +32,11 @@ from servobench.harness.batch.blocks import (
     open_workers,
 )
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
+from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.lock import check_empty, is_unused, locked
 from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.sandbox import Workers
 from servobench.harness.batch.tables import refuse_nameless, writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings, flatten

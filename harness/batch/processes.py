@@ -65,7 +65,7 @@ class Bounds:
     run_memory: float | None = (
         None  # [bytes] memory limit of a run, inf for none; None for the usual one
     )
-    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in sandboxes
+    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in isolated processes
 
     def limits(self, count: int, *, foreign: bool) -> Limits:
         """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""

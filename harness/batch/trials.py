@@ -1,4 +1,4 @@
-"""Trials of the code of users in a sandbox: imported, built, checked or validated before it is relied on.
+"""Trials of the code of users in an isolated process: imported, built, checked or validated before it is relied on.
 
 Code that ends its process, hangs or leaks memory costs one line, with its place where that is known.
 """
@@ -20,7 +20,7 @@ from servobench.plant.contract.faults import ConfigurationError, FmuError, confi
 
 if TYPE_CHECKING:
     from servobench.fmus.inspection import Validation
-    from servobench.harness.batch.sandbox import Tell
+    from servobench.harness.batch.isolation import Tell
 
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
@@ -58,7 +58,7 @@ def attempt(
     hear: Tell | None = None,
     quiet: bool = True,
 ) -> tuple[Any, str]:
-    """Call a function with code of users in a sandbox.
+    """Call a function with code of users in an isolated process.
 
     Args:
         function: takes the arguments, and `tell` before them if it is heard, and returns JSON values.
@@ -74,7 +74,7 @@ def attempt(
     Raises:
         ConfigurationError: that of the function.
     """
-    from servobench.harness.batch import processes, sandbox  # noqa: PLC0415 - lists of our own items need neither
+    from servobench.harness.batch import isolation, processes  # noqa: PLC0415 - lists of our own items need neither
 
     found = {}
 
@@ -86,7 +86,7 @@ def attempt(
                 found[part] = value
 
     limits = processes.Bounds(limit).limits(1, foreign=True)
-    end = sandbox.call(
+    end = isolation.call(
         _attempt_here, (function, arguments, quiet, hear is not None), limits, receive
     )
     if "refusal" in found:
@@ -114,7 +114,7 @@ def _attempt_here(
 
 
 def choose(word: Word, given: str) -> str:
-    """Return the name of a controller or plant; code of users that it names is imported in a sandbox first.
+    """Return the name of a controller or plant; code of users that it names is imported in an isolated process first.
 
     Args:
         word: the kind.
@@ -141,14 +141,14 @@ def _choose(word: Word, given: str) -> str:
 def try_all(word: Word, robot: str) -> list[Tried]:
     """Return all controllers or plants, with missing packages.
 
-    Those of third parties are built once for a robot and thrown away, each in a sandbox.
+    Those of third parties are built once for a robot and thrown away, each in an isolated process.
     """
     registry = REGISTRIES[word]
     points = {
         name: point for name in registry.names() if (point := registry.published(name)) is not None
     }
     if points:
-        import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each sandbox
+        import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each isolated process
     return [
         _try(word, points[name], robot) if name in points else _try_here(word, name)
         for name in registry.names()
@@ -156,7 +156,7 @@ def try_all(word: Word, robot: str) -> list[Tried]:
 
 
 def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
-    """Try one in a sandbox."""
+    """Try one in an isolated process."""
     try:
         answer, why = attempt(_try_here, word, point.name, robot, limit=TRIAL_LIMIT)
     except ConfigurationError as error:  # which such code may falsify

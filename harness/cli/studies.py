@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from servobench.harness.batch.sandbox import Workers
+    from servobench.harness.batch.isolation import Workers
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.resolution import ResolvedRun
     from servobench.harness.studies.tuning.campaign import Method, TunedValues, TuningPlan

@@ -13,8 +13,8 @@ from kit.nightly import some
 from kit.tuning import SMALL, cost_by_formula, read_tuned
 from servobench import controllers
 from servobench.controllers.aids import EQUIPPED
+from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.plan import TUNING
-from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import (
     apply_settings,

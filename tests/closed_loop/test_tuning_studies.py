@@ -9,7 +9,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, read_tuned
 from servobench import controllers
-from servobench.harness.batch.sandbox import Workers
+from servobench.harness.batch.isolation import Workers
 from servobench.harness.studies.tuning.campaign import (
     TuningPlan,
     advance,

@@ -24,7 +24,7 @@ import pytest
 
 from kit.command import judged
 from kit.nightly import some
-from servobench.harness.batch import blocks, results, sandbox
+from servobench.harness.batch import blocks, isolation, results
 from servobench.harness.batch.blocks import (
     Block,
     Job,
@@ -34,9 +34,9 @@ from servobench.harness.batch.blocks import (
     open_workers,
 )
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
+from servobench.harness.batch.isolation import Answer, End, Task, Workers
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.sandbox import Answer, End, Task, Workers
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import identity, run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -564,7 +564,7 @@ def test_a_task_that_is_done_with_fewer_answers_than_runs_has_a_row_for_each_run
         2: "crashed",
     }
     reasons = {result.row["reason"] for result in found if result.row["status"] == "crashed"}
-    assert (sandbox.SILENT in reasons) == (not unreadable)
+    assert (isolation.SILENT in reasons) == (not unreadable)
 
 
 def test_more_answers_than_runs_are_no_answer():
@@ -579,4 +579,4 @@ def test_more_answers_than_runs_are_no_answer():
         for _, part in carry_out_blocks([Block((job(0, None),))], Workers(submit))
         for result in part
     ]
-    assert (found.row["status"], found.row["reason"]) == ("crashed", sandbox.TALKATIVE)
+    assert (found.row["status"], found.row["reason"]) == ("crashed", isolation.TALKATIVE)

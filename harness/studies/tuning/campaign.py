@@ -20,8 +20,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, final
 
+from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.lock import LOCK
-from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.description import toml
 from servobench.harness.config.settings import default_config, file_stem, flatten
 from servobench.harness.studies.tuning.objective import (

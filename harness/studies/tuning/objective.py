@@ -33,9 +33,9 @@ import numpy as np
 
 from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.manifest import named_files, plugins
 from servobench.harness.batch.plan import TUNING, Cell, Survey, tuning_seeds
-from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
 from servobench.harness.run.experiment import build_once

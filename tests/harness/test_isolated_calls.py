@@ -1,4 +1,4 @@
-"""Sandboxes: calls with their answers, guards that do not start or are ended meanwhile, and guards that are stopped."""
+"""Isolated processes: calls with their answers, guards that do not start or are ended meanwhile or are stopped."""
 
 import multiprocessing
 import os
@@ -16,10 +16,10 @@ import pytest
 from kit.command import left_behind, python, start, wait_for
 from kit.forked import say_modules
 from kit.nightly import some
-from servobench.harness.batch import sandbox
+from servobench.harness.batch import isolation
 from servobench.harness.batch.blocks import open_workers
+from servobench.harness.batch.isolation import Pool, Task
 from servobench.harness.batch.processes import Bounds, Limits
-from servobench.harness.batch.sandbox import Pool, Task
 from servobench.plant.contract.faults import ConfigurationError
 
 
@@ -39,7 +39,7 @@ def importing(text, name, folder, monkeypatch):
 def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(sandbox, "GUARD_START", 0.5)
+    monkeypatch.setattr(isolation, "GUARD_START", 0.5)
     before = set(multiprocessing.active_children())
     with importing(
         "import time\n\ntime.sleep(60.0)\n", "slow_import", tmp_path, monkeypatch
@@ -104,7 +104,7 @@ def test_of_a_guard_that_is_ended_whenever_it_starts_the_signal_is_named(tmp_pat
 UNTOUCHED = """
 import os, pickle, signal
 from servobench.harness.batch.processes import Limits
-from servobench.harness.batch.sandbox import Pool, Task
+from servobench.harness.batch.isolation import Pool, Task
 
 def blocked(_, tell):
     tell([int(line.split()[1], 16) for line in open(f"/proc/{os.getppid()}/status") if line.startswith("SigBlk")])
@@ -135,7 +135,7 @@ KILLED = """
 import os, pickle, signal, subprocess, sys, time
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits
-from servobench.harness.batch.sandbox import Pool, Task
+from servobench.harness.batch.isolation import Pool, Task
 
 def hold(seconds, tell):
     tell(None)
@@ -220,7 +220,7 @@ def test_a_runner_that_somebody_stops_or_interrupts_goes_on(name, tmp_path):
         os.kill(runner, signal.Signals[name])
         (tmp_path / "file").touch()
 
-    assert sandbox.call(wait_for_file, tmp_path / "file", Limits(time=30.0), disturb) is None
+    assert isolation.call(wait_for_file, tmp_path / "file", Limits(time=30.0), disturb) is None
 
 
 def harm(how: str, tell) -> None:
@@ -248,7 +248,7 @@ def harm(how: str, tell) -> None:
 def test_a_call_returns_how_its_function_ended(how, end):
     told: list[object] = []
     beyond_count = 1e20  # [bytes], more than the system can limit
-    ended = sandbox.call(harm, how, Limits(3.0, beyond_count, addresses=True), told.append)
+    ended = isolation.call(harm, how, Limits(3.0, beyond_count, addresses=True), told.append)
     assert told == [["begins", how]]
     assert (ended and (ended.status, ended.reason)) == end
     assert multiprocessing.active_children() == []
@@ -263,10 +263,10 @@ def stop_for_ever(_, tell) -> None:
 
 @pytest.mark.slow
 def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
-    monkeypatch.setattr(sandbox, "START_TIME", 1.0)
-    monkeypatch.setattr(sandbox, "GRACE", 1.0)
+    monkeypatch.setattr(isolation, "START_TIME", 1.0)
+    monkeypatch.setattr(isolation, "GRACE", 1.0)
     told: list[int] = []
-    ended = sandbox.call(stop_for_ever, None, Limits(time=1.0), told.append)
+    ended = isolation.call(stop_for_ever, None, Limits(time=1.0), told.append)
     assert ended is not None
     assert ended.status == "timed_out"
     wait_for(lambda: has_ended(told[0]), 5.0)

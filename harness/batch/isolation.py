@@ -1,4 +1,4 @@
-"""A sandbox for the code of users: a guard, and below it the process that carries the code out.
+"""Isolation of the code of users: a guard, and below it the process that carries the code out.
 
     this process ── task ──> guard ── task ──> runner      answers return the same way, one by one
                              imports servobench, no plug-in; limits time, memory and processes of all below it
@@ -108,7 +108,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Workers:
-    """A place where tasks are carried out: this process, sandboxes or a cluster."""
+    """A place where tasks are carried out: this process, isolated processes or a cluster."""
 
     submit: Callable[..., Any] | None = (
         None  # takes a `Task` and returns a future; None: runs stay in this process
@@ -121,7 +121,7 @@ class Workers:
 def call(
     function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell
 ) -> Ending | None:
-    """Call a function in a sandbox, which is a copy of this process.
+    """Call a function in an isolated process, which is a copy of this one.
 
     Args:
         function: takes the argument and `tell`, which passes an answer of JSON values on.
@@ -132,30 +132,30 @@ def call(
     Returns:
         How the function ended if it did not return.
     """
-    sandbox = Sandbox(limits, (), copied=True)
+    isolated = IsolatedProcess(limits, (), copied=True)
     try:
-        end = sandbox.carry_out(Task(function, pickle.dumps(argument), "user"), hear).end
+        end = isolated.carry_out(Task(function, pickle.dumps(argument), "user"), hear).end
     finally:
-        sandbox.ask_to_end()
-        sandbox.end()
+        isolated.ask_to_end()
+        isolated.end()
     return None if end is None else end.ending
 
 
 class Pool:
-    """Sandboxes, which start with the first tasks, and the threads that talk to them."""
+    """Isolated processes, which start with the first tasks, and the threads that talk to them."""
 
     def __init__(self, count: int, limits: Limits, modules: Sequence[str]) -> None:
-        """Prepare sandboxes.
+        """Prepare isolated processes.
 
         Args:
-            count: of sandboxes.
+            count: number of isolated processes.
             limits: of each run.
             modules: imported once by each guard.
         """
         self._limits, self._modules = limits, modules
         self._threads = ThreadPoolExecutor(count)
         self._own = threading.local()
-        self._sandboxes: list[Sandbox] = []
+        self._isolated: list[IsolatedProcess] = []
 
     def submit(self, task: Task, hear: Tell | None = None) -> Future[Answer]:
         """Carry a task out; `hear` receives the answers instead of the future, in another thread."""
@@ -164,20 +164,20 @@ class Pool:
     def stop(self) -> None:
         """End everything; a task that was not carried out has no answer."""
         self._threads.shutdown(wait=False, cancel_futures=True)
-        for sandbox in self._sandboxes:
-            sandbox.ask_to_end()
-        for sandbox in self._sandboxes:
-            sandbox.end()
+        for isolated in self._isolated:
+            isolated.ask_to_end()
+        for isolated in self._isolated:
+            isolated.end()
 
     def _carry_out(self, task: Task, hear: Tell | None) -> Answer:
-        if not hasattr(self._own, "sandbox"):
-            self._own.sandbox = Sandbox(self._limits, self._modules)
-            self._sandboxes.append(self._own.sandbox)
-        answer: Answer = self._own.sandbox.carry_out(task, hear)
+        if not hasattr(self._own, "isolated"):
+            self._own.isolated = IsolatedProcess(self._limits, self._modules)
+            self._isolated.append(self._own.isolated)
+        answer: Answer = self._own.isolated.carry_out(task, hear)
         return answer
 
 
-class Sandbox:
+class IsolatedProcess:
     """A guard as seen from this process; one that was ended, for instance by a plug-in, is started anew."""
 
     def __init__(self, limits: Limits, modules: Sequence[str], *, copied: bool = False) -> None:
