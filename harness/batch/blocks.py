@@ -511,11 +511,10 @@ def open_workers(
         remark(
             "the memory and the processes of a run cannot be watched here, only its time: /proc does not say them"
         )
-    pool = Pool(
-        count,
-        limits,
-        (*MODULES, *["pandas"] * (steps or foreign), *registry.own_modules(plants, controllers)),
-    )
+    modules = [*MODULES, *registry.own_modules(plants, controllers)]
+    if steps or foreign:
+        modules.append("pandas")
+    pool = Pool(count, limits, modules)
     try:
         yield Workers(pool.submit, count)
     finally:

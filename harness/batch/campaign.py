@@ -219,9 +219,11 @@ def _carry_out_at(
             check_same_batch(
                 folder, manifest, how.observer.note, remedy="give another folder as `out`"
             )
-            for line in [restored] * bool(restored) + list(
-                mend(folder, manifest)
-            ):  # before anything is computed
+            # Before anything is computed
+            mended = list(mend(folder, manifest))
+            if restored:
+                mended.insert(0, restored)
+            for line in mended:
                 how.observer.note(f"note: {line}")
         else:
             results.create_folder(folder, manifest)

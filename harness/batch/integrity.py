@@ -99,7 +99,8 @@ def examine(folder: Path) -> Examination:
         count = max(count, tables.row_count(folder, RUNS))
     if count and not findings:
         results.load_runs(folder)
-    for name in (beside := results.accompanying(folder)):
+    beside = results.accompanying(folder)
+    for name in beside:
         if wrong := results.file_fault(folder, name):
             findings.append(Finding(name, wrong, REMADE))
     left_out = [name for name in results.unlisted(folder) if name not in names and name != MANIFEST]

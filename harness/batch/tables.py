@@ -276,7 +276,8 @@ RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")
 def lacking(kind: str, schema: pa.Schema) -> str:
     """Return which columns a table of runs or steps lacks, or has of another type, as a predicate; empty if none."""
     if missing := [name for name in NEEDED[kind] if name not in schema.names]:
-        return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}"
+        columns = "column" if len(missing) == 1 else "columns"
+        return f"lacks the {columns} {', '.join(missing)}"
     for name, given in zip(schema.names, schema.types, strict=True):
         is_text = pa.types.is_string(given) or pa.types.is_large_string(given)
         is_whole, is_truth = (

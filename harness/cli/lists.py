@@ -156,10 +156,10 @@ def _list_or_show(word: Word, name: str | None, *, as_json: bool) -> None:
 
     registry = REGISTRIES[word]
     if name:
-        entry = registry.find(name := choose(word, name))
-        _show_settings(
-            name, entry.config() if word == "plant" else default_config(entry), as_json=as_json
-        )
+        name = choose(word, name)
+        entry = registry.find(name)
+        config = entry.config() if word == "plant" else default_config(entry)
+        _show_settings(name, config, as_json=as_json)
         return
     found = [
         {"name": each.name, "error": each.fault}

@@ -68,7 +68,8 @@ def statistics(
     runs = titled_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
-        sys.stderr.write(f"{missing}\n" * bool(missing))
+        if missing:
+            sys.stderr.write(f"{missing}\n")
         found = [
             {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
             for place, controllers, pairs in statistics_rows(runs, metric)
@@ -80,7 +81,10 @@ def statistics(
     if latex:
         say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
         return
-    print_markdown(tables) if markdown else print_tables(tables)
+    if markdown:
+        print_markdown(tables)
+    else:
+        print_tables(tables)
     say(describe_controllers(folder))
 
 

@@ -122,7 +122,9 @@ def completing_lists(complete: Callable[[str], list[str]]) -> Callable[[str], li
 
     def complete_last(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",")
-        words = complete(last) + _matching(last, [ALL] * (not comma))
+        words = complete(last)
+        if not comma:
+            words += _matching(last, [ALL])
         return [before + comma + word for word in words]
 
     return complete_last

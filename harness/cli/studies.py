@@ -313,10 +313,13 @@ def tune(
 
 def _counted(plan: TuningPlan) -> str:
     """Return how many points and runs a campaign has, without those of its second set of robots."""
-    methods, budget, runs = len(plan.controllers), plan.trials + plan.search, len(plan.runs.runs())
+    methods = len(plan.controllers)
+    budget = plan.trials + plan.search
+    runs = len(plan.runs.runs())
     points = methods * plan.studies * budget
-    words = f"{methods} method{'s' * (methods > 1)} × {plan.studies} studies × {budget} points"
-    return f"{words} × {runs} runs = {points * runs} runs"
+    compared = "1 method" if methods == 1 else f"{methods} methods"
+    factors = f"{compared} × {plan.studies} studies × {budget} points × {runs} runs"
+    return f"{factors} = {points * runs} runs"
 
 
 def _end_interrupted(out: Path) -> NoReturn:
@@ -468,8 +471,11 @@ def analyse(
         page = out / write_pictures(partial, loops, text, LEGEND)[0].name
     identified = ", ".join(loop.name for loop in loops if loop.model == "identified")
     title = f"Loops at rest, estimators frozen at the {jacobian} Jacobian"
-    title += f"; identified in small motions: {identified}" * bool(identified)
-    print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
+    if identified:
+        title += f"; identified in small motions: {identified}"
+    if identify:
+        title = "Loops identified in small motions"
+    print_tables([(title, text)], LEGEND)
     say(f"table in {out / TABLE}, pictures in {page}")
 
 

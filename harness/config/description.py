@@ -129,14 +129,15 @@ def configuration_file(
     for section, config in sections.items():
         settings = list(describe_settings(config))
         normal = {each.key: toml(each.value) for each in describe_settings(defaults[section])}
-        for group in dict.fromkeys(
-            ["", *(each.group for each in settings)]
-        ):  # nested sections after their own
+        # Nested sections follow their own
+        for group in dict.fromkeys(["", *(each.group for each in settings)]):
             lines = [
                 _line(each, normal.get(each.key, "")) for each in settings if each.group == group
             ]
-            title = "" if group else _comment(titles[section])
-            parts.append(f"{title}[{_key(section)}{'.' * bool(group)}{group}]\n{''.join(lines)}")
+            heading = f"[{_key(section)}.{group}]"
+            if not group:
+                heading = f"{_comment(titles[section])}[{_key(section)}]"
+            parts.append(f"{heading}\n{''.join(lines)}")
     return "\n".join(parts)
 
 

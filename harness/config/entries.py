@@ -240,7 +240,8 @@ def _controller_of_object(given: Controller) -> ControllerEntry:
 
 def _checked_controller(entry: ControllerEntry, place: str) -> ControllerEntry:
     check_settings(entry.config, place)
-    guarded = replace(entry, build=(build := _guarded(entry.build, Controller)))
+    build = _guarded(entry.build, Controller)
+    guarded = replace(entry, build=build)
     aids = getattr(build.make, "aids", None)
     with configuration_errors(f"{place}: "):
         return guarded if aids is None else with_aids(guarded, aids)
