@@ -31,7 +31,7 @@ lowest:
 	build/lowest/bin/python -m pytest -n auto --dist loadgroup -m "not slow"
 
 # Renew every measured table and picture of the pages: a night. The same call goes on after an interruption;
-# ONLY=held_out,rates renews these, RUNS is the folder of the runs. docs/experiments.md lists the studies.
+# ONLY=held_out,rates renews these, RUNS is the folder of the runs. CONTRIBUTING.md lists the studies.
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
 

@@ -244,8 +244,8 @@ class Pairing:
         doubtful = MAX_DOUBTFUL_GAP * motion
         self.gap = MAX_GAP * motion
         self._longest_doubtful = (doubtful + 0.5) * spec.period
-        # The rows reach back to the begin of the longest motion since an anchor at the longest delay. Four more are for
-        # this period, for the two rows beyond that interpolation needs, and for rounding.
+        # The rows reach back to the beginning of the longest motion since an anchor at the longest delay. Four more are
+        # for this period, for the two rows beyond that interpolation needs, and for rounding.
         self._rows = self._candidates.longest + self.gap + doubtful + 4
         self.regression = Regression(knowledge)
         self._variances = np.repeat([MAP_DEVIATION**2, REST_DEVIATION**2], [self._m, self._n])

@@ -170,7 +170,7 @@ def path_length(points: FloatArray) -> FloatArray:
 
 
 def sign_switches(command: FloatArray, limit: FloatArray) -> npt.NDArray[np.int_]:
-    """Return how often joints are driven to and fro, summed over joints.
+    """Return how often joints are driven back and forth, summed over joints.
 
     A joint switches in a period whose command is large, that is at least `LARGE_COMMAND` of the limit, if its previous
     large command has the other sign and is at most `SWITCH_PERIODS` periods old. A slow reversal is no switch.
@@ -348,8 +348,8 @@ _ALL: Final = (
     ),
     Metric(
         "command_switches", "1", "sign switches", 0,
-        "how often joints are driven to and fro: periods whose command is at least 10 % of the joint's speed limit and "
-        "whose last command of that size, one or two periods before, had the other sign; sum over joints",
+        "how often joints are driven back and forth: periods whose command is at least 10 % of the joint's speed limit "
+        "and whose last command of that size, one or two periods before, had the other sign; sum over joints",
         lambda run: sign_switches(run.command, run.steps.spec.joint_velocity_limit).astype(np.float64),
         tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary(0),
     ),

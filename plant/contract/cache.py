@@ -166,7 +166,7 @@ def _is_there(entry: Path) -> bool:
 def is_whole(entry: Path) -> bool:
     """Return whether the files of an entry are there as they were made; additional files do not matter."""
     with contextlib.suppress(OSError):
-        if not (entry / SUMS).is_file():  # A pipe would be read for ever.
+        if not (entry / SUMS).is_file():  # A pipe would be read forever.
             return False
         sums = read_sums(entry) or {}
         return bool(sums) and all(fault(entry, name, sums) is None for name in sums)

@@ -1,6 +1,6 @@
 """Units in which users may write quantities, such as `80ms`, `60deg`, `2px`, `125Hz` or `1/30`.
 
-A setting's own unit stands in brackets at the begin of the string below its field; a plain number is in this unit.
+A setting's own unit stands in brackets at the beginning of the string below its field; a plain number is in this unit.
 """
 
 import math
