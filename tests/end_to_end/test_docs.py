@@ -233,7 +233,7 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
         "make run",
         "servobench run --plant",
         "TABLE",
-        "Start",
+        "Four doors",
         "How to",
         "Reference",
         "Explanation",

@@ -163,7 +163,7 @@ def test_all_tables_of_pages_belong_to_a_study_and_all_stored_ones_are_on_a_page
         name
         for _, kind, names, *_ in parts
         if kind in {"table", "stored"}
-        for name in names.split(",")
+        for name in names.partition(":")[0].split(",")
     }
     stored = {
         path.stem: stored_tables.read(path).stamp["study"]
