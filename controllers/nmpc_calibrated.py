@@ -208,7 +208,9 @@ class NmpcCalibrated(Controller):
 
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the true Jacobian (m, n) at the last observation, or None before there was one."""
-        return None if self._jacobian is None else self._knowledge.unit * self._jacobian
+        if self._jacobian is None:
+            return None
+        return self._knowledge.unit * self._jacobian
 
     def _shared(self) -> Iterable[object]:
         return self._knowledge, self._model, self._along_plan, self._shape, self._program

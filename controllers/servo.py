@@ -267,7 +267,9 @@ class ServoController(Controller):
 
     def diagnostics(self) -> Diagnostics:
         """Return the diagnostics of the servo."""
-        return {} if self.state is None else self.servo.diagnostics(self.state)
+        if self.state is None:
+            return {}
+        return self.servo.diagnostics(self.state)
 
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the Jacobian (m, n) that the last step used, or None before there is one."""

@@ -37,7 +37,9 @@ class Platform:
 
     def folder(self, fmi_version: int) -> str:
         """Return the folder below binaries/ of an FMU."""
-        return self.fmi2_folder if fmi_version == 2 else self.name
+        if fmi_version == 2:
+            return self.fmi2_folder
+        return self.name
 
 
 _LINUX = ("-fPIC", "-Wl,--build-id=none", "-s")

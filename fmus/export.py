@@ -77,7 +77,9 @@ class ExportOptions:
     def view(self) -> View | None:
         """The sensing set-up; None for the ball in 3-D by a fixed camera."""
         model = self.model
-        return View.of(model) if isinstance(model, SetupModel) else None
+        if isinstance(model, SetupModel):
+            return View.of(model)
+        return None
 
     @property
     def layout(self) -> ArmLayout:

@@ -187,7 +187,9 @@ def documentation(folder: str, layout: Layout, **words: str) -> str:
 def word(text: str, otherwise: str) -> str:
     """Return a text as a word of C, which begins with `otherwise` where it does not begin with a letter."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", text)
-    return plain if plain[:1].isalpha() else f"{otherwise}_{plain}"
+    if plain[:1].isalpha():
+        return plain
+    return f"{otherwise}_{plain}"
 
 
 def _token(contents: Mapping[str, bytes]) -> str:

@@ -90,7 +90,9 @@ class View(NamedTuple):
     @property
     def word(self) -> str:
         """Name of set-up and mount, as a word of C."""
-        return self.setup.name if self.mount == "fixed" else f"{self.setup.name}_{self.mount}"
+        if self.mount == "fixed":
+            return self.setup.name
+        return f"{self.setup.name}_{self.mount}"
 
     @property
     def setting(self) -> str:

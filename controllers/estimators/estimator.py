@@ -63,7 +63,9 @@ class Estimator(ABC, Generic[State]):
     ) -> FloatArray:
         """Return Ĵ − Ĵ_first at `joint_position` (..., n), rad; Ĵ where there is no first state."""
         jacobian = self.jacobian(state, joint_position)
-        return jacobian if first is None else jacobian - self.jacobian(first, joint_position)
+        if first is None:
+            return jacobian
+        return jacobian - self.jacobian(first, joint_position)
 
     def diagnostics(self, state: State) -> Diagnostics:
         """Return named numbers (...) about the last update, if there are any; for the log only."""

@@ -232,7 +232,9 @@ def as_numbers(value: Any) -> Any:  # noqa: ANN401 - an array, or lists and tupl
     """Return a value with plain numbers in the place of its constant arrays."""
     if type(value) in {list, tuple}:
         return type(value)(map(as_numbers, value))
-    return value.numbers() if isinstance(value, Traced) else value
+    if isinstance(value, Traced):
+        return value.numbers()
+    return value
 
 
 def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
@@ -242,7 +244,9 @@ def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
 
 def as_traced(value: Any) -> Traced:  # noqa: ANN401 - anything array-like
     """Return anything array-like as an array of expressions."""
-    return value if isinstance(value, Traced) else Traced.plain(np.asarray(value))
+    if isinstance(value, Traced):
+        return value
+    return Traced.plain(np.asarray(value))
 
 
 def picked(array: Any, index: Traced) -> Traced:  # noqa: ANN401 - any array
@@ -335,7 +339,9 @@ def _called(
         return PRODUCTS[name](*map(as_traced, inputs))
     result = elementwise(name, *inputs)
     chosen = options.get("where", True)
-    return result if chosen is True else choose(chosen, result, outputs[0])
+    if chosen is True:
+        return result
+    return choose(chosen, result, outputs[0])
 
 
 def elementwise(name: str, *inputs: Any) -> Traced:  # noqa: ANN401 - anything array-like

@@ -93,7 +93,9 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
         NotTraceable: the function uses expressions that are not among its arguments.
     """
     if not isinstance(chosen, Traced) or chosen.constant:
-        return function(tree, *arguments) if chosen else tree
+        if chosen:
+            return function(tree, *arguments)
+        return tree
     if chosen.ndim:
         return _side_by_side(chosen, function, tree, *arguments)
     given = leaves_of((tree, arguments))

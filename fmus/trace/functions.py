@@ -317,7 +317,9 @@ def svd(a: Any, full_matrices: bool = True, compute_uv: bool = True) -> Svd | Tr
     else:
         V, values, U = each_matrix(function, table.mT)
     values = values[..., 0]
-    return Svd(U, values, V.mT) if compute_uv else values
+    if compute_uv:
+        return Svd(U, values, V.mT)
+    return values
 
 
 @cache

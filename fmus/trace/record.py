@@ -60,11 +60,15 @@ class _Numpy:
 
     @staticmethod
     def ascontiguousarray(value: Any) -> Any:  # noqa: ANN401 - as numpy's
-        return value if isinstance(value, Traced) else np.ascontiguousarray(value)
+        if isinstance(value, Traced):
+            return value
+        return np.ascontiguousarray(value)
 
     @staticmethod
     def float64(value: Any) -> Any:  # noqa: ANN401 - as numpy's
-        return value if isinstance(value, Traced) else np.float64(value)
+        if isinstance(value, Traced):
+            return value
+        return np.float64(value)
 
     @staticmethod
     def zeros(shape: Any, dtype: Any = np.float64) -> Traced:  # noqa: ANN401 - as numpy's
@@ -93,7 +97,9 @@ class _Numpy:
 
 def _real(dtype: Any) -> Any:  # noqa: ANN401 - as numpy's
     """Return a type of numpy's; `float64` of recorded code is `_Numpy.float64`."""
-    return np.float64 if dtype is _Numpy.float64 else dtype
+    if dtype is _Numpy.float64:
+        return np.float64
+    return dtype
 
 
 _MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (

@@ -355,7 +355,9 @@ def grouped(rows: Any) -> pd.DataFrame:  # noqa: ANN401 - rows, or columns by th
 
 def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
     """Return a column of the table of runs, NaN throughout where the table has none of this name."""
-    return runs[name] if name in runs else pd.Series(np.nan, index=runs.index, name=name)
+    if name in runs:
+        return runs[name]
+    return pd.Series(np.nan, index=runs.index, name=name)
 
 
 def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
@@ -395,7 +397,9 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
 
 def achievement(runs: pd.DataFrame) -> str:
     """Return the word for a good outcome of these runs of one task: `settled`, or `followed` on a curve."""
-    return FOLLOWED if (texts_of(runs, "task_kind") == CURVE).any() else SETTLED
+    if (texts_of(runs, "task_kind") == CURVE).any():
+        return FOLLOWED
+    return SETTLED
 
 
 def handy_unit(feature_unit: str | None) -> tuple[str, float]:
@@ -409,7 +413,9 @@ def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
     """Return the unit in which a metric of these runs is shown, and the factor to it."""
     metric = METRICS[name]
     if metric.unit:
-        return ("%", 100.0) if metric.percent else (metric.unit, 1.0)
+        if metric.percent:
+            return ("%", 100.0)
+        return (metric.unit, 1.0)
     units = texts_of(runs, "feature_unit").dropna().unique().tolist()
     if len(units) > 1:
         return (" or ".join(units), 1.0)
@@ -419,7 +425,9 @@ def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
 def metric_heading(name: str, runs: pd.DataFrame) -> str:
     """Return the label of a metric with the unit in which it is shown for these runs."""
     unit, _ = shown_unit(name, runs)
-    return METRICS[name].label if unit == "1" else f"{METRICS[name].label} [{unit}]"
+    if unit == "1":
+        return METRICS[name].label
+    return f"{METRICS[name].label} [{unit}]"
 
 
 def is_superfluous(name: str, runs: pd.DataFrame) -> bool:
@@ -447,7 +455,9 @@ def settling_band(runs: pd.DataFrame, factor: float = 1.0) -> str:
     """Return the settling band of these runs times a factor with its unit, `5 mm`; words where they have several."""
     known = runs.reindex(columns=["settling_band", "feature_unit"]).dropna().drop_duplicates()
     if len(known) != 1:
-        return "the settling band" if factor == 1.0 else f"{factor:g} settling bands"
+        if factor == 1.0:
+            return "the settling band"
+        return f"{factor:g} settling bands"
     (band,) = known["settling_band"]
     (unit,) = known["feature_unit"]
     name, to_handy = handy_unit(str(unit))

@@ -131,4 +131,6 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of a table
     if isinstance(value, bool | np.bool_):
         return bool(value)
     number = math.nan if value is None else float(value)
-    return number if math.isfinite(number) else None
+    if math.isfinite(number):
+        return number
+    return None

@@ -162,7 +162,9 @@ def _by_robot(table: pd.DataFrame, column: str, *, lost: bool = False) -> pd.Dat
         raise ValueError(
             f"{name} lacks the {column} of challenge {challenge}, seed {seed}: methods need the same runs"
         )
-    return filled.where(filled != np.inf) if lost else filled
+    if lost:
+        return filled.where(filled != np.inf)
+    return filled
 
 
 def _rows_of_challenges(by_robot: pd.DataFrame) -> list[npt.NDArray[np.intp]]:

@@ -220,7 +220,9 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
 
 def _median(values: pd.Series[float]) -> Estimate:
     """Return the median of a column, a missing value counting as ∞; no estimate where all are missing."""
-    return median_with_interval(values) if values.notna().any() else NO_ESTIMATE
+    if values.notna().any():
+        return median_with_interval(values)
+    return NO_ESTIMATE
 
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
@@ -592,4 +594,6 @@ def _kind_of(word: str) -> str:
     """Return the group of columns of an outcome."""
     if word in ACHIEVED:
         return "As asked"
-    return "Reached the last period" if word in OUTCOMES else "Ended early"
+    if word in OUTCOMES:
+        return "Reached the last period"
+    return "Ended early"

@@ -103,7 +103,9 @@ def leaders(runs: pd.DataFrame) -> pd.DataFrame:
 
 def judged_metric(place: pd.DataFrame) -> str:
     """Return the column by which the runs of a place are compared."""
-    return "rms_error_evaluated" if achievement(place) == FOLLOWED else "settling_time_s"
+    if achievement(place) == FOLLOWED:
+        return "rms_error_evaluated"
+    return "settling_time_s"
 
 
 def judged_values(place: pd.DataFrame) -> pd.DataFrame:
@@ -318,7 +320,9 @@ def _competitions(
         if own["controller"].nunique() > 1:
             where = str(place["task"].iloc[0]) if alone else words
             found.append((where, place, own))
-    return found if len(found) <= MOST_PLACES else []
+    if len(found) <= MOST_PLACES:
+        return found
+    return []
 
 
 def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str, Difference]]:

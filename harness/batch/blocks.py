@@ -85,9 +85,9 @@ class Job:
         foreign = registry.is_foreign_plant(
             plant, trusted=not getattr(self.run.plant, "isolate", True)
         )
-        return (
-            f"{plant} {controller}" if foreign or registry.is_foreign_controller(controller) else ""
-        )
+        if foreign or registry.is_foreign_controller(controller):
+            return f"{plant} {controller}"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,9 @@ def _outcome(
 def _received(future: Future[Answer | bytes]) -> Answer:
     """Return the answer of a worker, which comes from elsewhere as one compressed block."""
     told = future.result()
-    return told if isinstance(told, Answer) else Answer(json.loads(zlib.decompress(told)))
+    if isinstance(told, Answer):
+        return told
+    return Answer(json.loads(zlib.decompress(told)))
 
 
 def _task(

@@ -471,4 +471,6 @@ def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 def _short(value: object) -> str:
     """Return a value in one line, or the beginning of it."""
     text = ",".join(map(str, value)) if isinstance(value, list) else str(value)
-    return text if len(text) <= 60 else f"{text[:59]}…"
+    if len(text) <= 60:
+        return text
+    return f"{text[:59]}…"

@@ -526,7 +526,9 @@ def _describe_instant() -> str:
     """Return the addition to a reason that the time of the run makes; empty where no run was carried out."""
     if INSTANT.value == -math.inf:
         return ", before its first period"
-    return "" if math.isnan(INSTANT.value) else f", in the period from {INSTANT.value:.6g} s on"
+    if math.isnan(INSTANT.value):
+        return ""
+    return f", in the period from {INSTANT.value:.6g} s on"
 
 
 def _describe_exit(code: int | None) -> str:

@@ -128,7 +128,9 @@ def current_holder(folder: Path) -> Holder | None:
     """
     refuse_links(folder)
     holder = Holder.read(folder / LOCK)
-    return None if holder is None or holder.gone else holder
+    if holder is None or holder.gone:
+        return None
+    return holder
 
 
 def _acquire(path: Path) -> tuple[int, Holder | None]:

@@ -297,9 +297,9 @@ class Place:
 
     def vary(self, mismatch: Mismatch) -> Mismatch:
         """Return a mismatch with the axis put on top of it."""
-        return (
-            mismatch if self.magnitude is None else _with_axis(mismatch, self.axis, self.magnitude)
-        )
+        if self.magnitude is None:
+            return mismatch
+        return _with_axis(mismatch, self.axis, self.magnitude)
 
 
 @lru_cache
@@ -364,7 +364,9 @@ def _size(value: Value) -> object:
     own = next(
         (own for own, units in UNITS.items() if parts and parts[1] and parts[1] in units), ""
     )
-    return (own, round(in_own_unit(*parts, own), 12)) if parts and own else value
+    if parts and own:
+        return (own, round(in_own_unit(*parts, own), 12))
+    return value
 
 
 @dataclass

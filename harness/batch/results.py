@@ -328,11 +328,9 @@ def missing_line(count: int, wanted: int) -> str:
     """Return a line for the user that other than the `wanted` runs are finished; an empty text if these are."""
     if 0 < wanted < count:
         return f"{count} runs are there, and the manifest is of {wanted}: a file of another folder is among them"
-    return (
-        f"{count} of {wanted} runs are there: --resume carries out the others"
-        if count < wanted
-        else ""
-    )
+    if count < wanted:
+        return f"{count} of {wanted} runs are there: --resume carries out the others"
+    return ""
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:

@@ -88,7 +88,9 @@ def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
         values = [row.get(name) for row in rows]
         made = pa.array(values, from_pandas=True)
         numbers = name in NUMBERS or float in map(type, values)
-        return made.cast(pa.float64()) if pa.types.is_null(made.type) and numbers else made
+        if pa.types.is_null(made.type) and numbers:
+            return made.cast(pa.float64())
+        return made
 
     return pa.table(
         {name: column(name) for name in dict.fromkeys(name for row in rows for name in row)}
@@ -228,7 +230,9 @@ def unfit_names(names: tuple[str, ...]) -> str:
     fit = len(set(names)) == len(names) and all(
         each.isprintable() and len(each) <= MAX_NAME for each in names
     )
-    return "" if fit else "has two columns of one name, or a name that cannot be printed"
+    if fit:
+        return ""
+    return "has two columns of one name, or a name that cannot be printed"
 
 
 @contextlib.contextmanager

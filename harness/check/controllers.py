@@ -300,11 +300,9 @@ class ControllerChecks:
                 f"a step takes {1e3 * typical:.0f} ms, longer than {period}: a robot would get its commands too late; "
                 "move work to the constructor, or choose a longer run.period"
             )
-        return (
-            f"a step took {1e3 * longest:.0f} ms, longer than {period}"
-            if longest > PERIOD
-            else None
-        )
+        if longest > PERIOD:
+            return f"a step took {1e3 * longest:.0f} ms, longer than {period}"
+        return None
 
     def output(self) -> str | None:
         """It prints nothing."""
@@ -318,7 +316,9 @@ class ControllerChecks:
         entry, values = self.entry, flatten(default_config(self.entry))
         words = describe_aids(values)
         if not words.startswith("without"):
-            return None if words == "with all aids" else words
+            if words == "with all aids":
+                return None
+            return words
         if "aids.delay" in values or not isinstance(getattr(entry.build, "make", None), type):
             return (
                 f"{words}; its settings `aids`, or the argument `aids` of its Servo, switch them on"

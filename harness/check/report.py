@@ -117,19 +117,25 @@ def _finding(check: Check) -> Finding:
     except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
         notes = (each for each in getattr(error, "__notes__", ()) if each.startswith(HAPPENS))
         return Finding(check.name, "failed", "".join([_defect(error), *notes, _remedy(error)]))
-    return Finding(check.name, "note", note) if note else Finding(check.name, "ok")
+    if note:
+        return Finding(check.name, "note", note)
+    return Finding(check.name, "ok")
 
 
 def _defect(error: BaseException) -> str:
     if isinstance(error, WrongAnswer):
         return f"{at(error.method)}: {error}"
-    return str(error) if isinstance(error, CheckFailed | ConfigurationError) else describe_at(error)
+    if isinstance(error, CheckFailed | ConfigurationError):
+        return str(error)
+    return describe_at(error)
 
 
 def at(method: Any) -> str:  # noqa: ANN401 - a method or a function
     """Return `FILE:LINE` of a method."""
     code = getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)
-    return f"{show(Path(code.co_filename))}:{code.co_firstlineno}" if code else "step"
+    if code:
+        return f"{show(Path(code.co_filename))}:{code.co_firstlineno}"
+    return "step"
 
 
 def _remedy(error: BaseException) -> str:

@@ -208,7 +208,9 @@ def _resuming() -> str:
     """Return how the command goes on after an error of the system, if it has finished runs to keep."""
     called = command_line().commands.get("".join(sys.argv[1:2]))
     kept = called is not None and any(option.name == "resume" for option in called.params)
-    return "; finished runs are kept, --resume continues" if kept else ""
+    if kept:
+        return "; finished runs are kept, --resume continues"
+    return ""
 
 
 def _end(line: str) -> NoReturn:
@@ -227,7 +229,9 @@ def _usage_line(error: typer.TyperException) -> str:
         return f"{context.info_name} has no {option}: it is a setting, --set {key}=...; sweep varies it by {option}"
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())
-    return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""
+    if words:
+        return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}"
+    return ""
 
 
 def short_key(option: str) -> str:
@@ -268,7 +272,9 @@ def _line_for_user(error: ValueError | ImportError | RecursionError | MemoryErro
     if isinstance(error, MemoryError) and "--debug" not in sys.argv:
         shortage = str(error) or "no more is free"
         return f"the memory is not enough: {shortage}; make the work smaller, or use fewer workers"
-    return str(error) if isinstance(error, ConfigurationError) else None
+    if isinstance(error, ConfigurationError):
+        return str(error)
+    return None
 
 
 @contextlib.contextmanager

@@ -75,11 +75,9 @@ def named_option(
     ABSENT.update(((command, name), reason) for command, reason in (absent or {}).items())
 
     def check(context: typer.Context, text: Any) -> Any:  # noqa: ANN401 - typer's own word for it
-        return (
-            text
-            if kind.check is None or text is None or context.resilient_parsing
-            else kind.check(text)
-        )
+        if kind.check is None or text is None or context.resilient_parsing:
+            return text
+        return kind.check(text)
 
     return typer.Option(
         *name.split(), metavar=kind.word, help=words, autocompletion=kind.complete,

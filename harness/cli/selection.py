@@ -82,7 +82,9 @@ def _begun_controllers(word: str) -> Iterable[str]:
     from servobench.harness.config.registry import controller_names
 
     law, plus, _ = word.partition("+")
-    return [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names()
+    if plus:
+        return [f"{law}+{name}" for name in ESTIMATORS]
+    return controller_names()
 
 
 def _begun_mismatches(word: str) -> Iterable[str]:
@@ -218,4 +220,6 @@ def split_names(
 
 def _chosen(find: Callable[[str], Any], word: str) -> str:
     found = find(word)
-    return found if isinstance(found, str) else word
+    if isinstance(found, str):
+        return found
+    return word

@@ -93,8 +93,12 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any setting
     if isinstance(value, np.ndarray | tuple | list):
         return [plain(each) for each in value]
     if isinstance(value, float):
-        return float(value) if math.isfinite(value) else str(value)
-    return value if isinstance(value, str | bool | int | None) else str(value)
+        if math.isfinite(value):
+            return float(value)
+        return str(value)
+    if isinstance(value, str | bool | int | None):
+        return value
+    return str(value)
 
 
 def restored(value: Any) -> Any:  # noqa: ANN401 - any setting
@@ -103,7 +107,9 @@ def restored(value: Any) -> Any:  # noqa: ANN401 - any setting
         return {key: restored(each) for key, each in value.items()}
     if isinstance(value, list):
         return [restored(each) for each in value]
-    return float(value) if value in ("inf", "-inf", "nan") else value
+    if value in ("inf", "-inf", "nan"):
+        return float(value)
+    return value
 
 
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
@@ -158,4 +164,6 @@ def _comment(text: str) -> str:
 
 
 def _key(name: str) -> str:
-    return name if BARE_KEY.fullmatch(name) else json.dumps(name, ensure_ascii=False)
+    if BARE_KEY.fullmatch(name):
+        return name
+    return json.dumps(name, ensure_ascii=False)

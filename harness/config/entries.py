@@ -131,9 +131,9 @@ def add_checks(world: type[World]) -> type[World]:
 
         def see(self) -> FloatArray | None:
             seen = super().see()
-            return (
-                None if seen is None else as_answer("see", seen, self.spec.m, "features, or None")
-            )
+            if seen is None:
+                return None
+            return as_answer("see", seen, self.spec.m, "features, or None")
 
     def as_answer(method: str, answer: object, size: int, content: str) -> FloatArray:
         wanted = f"{world.__name__}.{method} must return {size} {content}"
@@ -244,7 +244,9 @@ def _checked_controller(entry: ControllerEntry, place: str) -> ControllerEntry:
     guarded = replace(entry, build=build)
     aids = getattr(build.make, "aids", None)
     with configuration_errors(f"{place}: "):
-        return guarded if aids is None else with_aids(guarded, aids)
+        if aids is None:
+            return guarded
+        return with_aids(guarded, aids)
 
 
 def _plant_of_class(given: type[Any]) -> PlantEntry:
@@ -294,7 +296,9 @@ PLANT: Final = Kind(
 
 
 def _guarded(build: Callable[..., Any], kind: type[Controller | Plant]) -> Guarded:
-    return build if isinstance(build, Guarded) else Guarded(build, kind)
+    if isinstance(build, Guarded):
+        return build
+    return Guarded(build, kind)
 
 
 def check_class(kind: type[Any]) -> None:
@@ -395,11 +399,9 @@ def _class_place(kind: type[Any]) -> str:
 def _describe(given: object) -> str:
     if isinstance(given, type):
         return f"the class {given.__name__}"
-    return (
-        f"the function {given.__name__}"
-        if inspect.isroutine(given)
-        else f"of type {type(given).__name__}"
-    )
+    if inspect.isroutine(given):
+        return f"the function {given.__name__}"
+    return f"of type {type(given).__name__}"
 
 
 @dataclass(frozen=True)

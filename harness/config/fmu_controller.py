@@ -220,7 +220,9 @@ class FmuController(Controller):
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the Jacobian that the FMU tells, or None where it tells none, or zeros."""
         told = self._outputs.values[self._shape[1] :]
-        return told.reshape(self._shape).copy() if told.any() else None
+        if told.any():
+            return told.reshape(self._shape).copy()
+        return None
 
     def save(self) -> bytes:
         """Return the state of the FMU.

@@ -38,7 +38,9 @@ def missing_extra(error: ImportError, user: str) -> str | None:
         user: the feature that needs the module, such as "a film".
     """
     module = (error.name or "").partition(".")[0]
-    return _line(module, user) if module in EXTRAS else None
+    if module in EXTRAS:
+        return _line(module, user)
+    return None
 
 
 def check_installed(modules: tuple[str, ...], user: str) -> None:
@@ -118,7 +120,9 @@ def version_line() -> str:
     if commit is not None:
         hash_, dirty, _ = commit.partition("-dirty")
         return f"{line} (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})"
-    return line if reason is None else f"{line} (commit unknown: {reason})"
+    if reason is None:
+        return line
+    return f"{line} (commit unknown: {reason})"
 
 
 def blas_libraries() -> list[dict[str, Any]]:

@@ -168,7 +168,9 @@ class Registry(Generic[Entry]):
 
     def published(self, name: str) -> EntryPoint | None:
         """Return where another distribution has the entry of this name; None where no other has it."""
-        return None if name in self.own or name in _OFFERED else _points(self.group).get(name)
+        if name in self.own or name in _OFFERED:
+            return None
+        return _points(self.group).get(name)
 
     def unused_points(self) -> list[tuple[str, str]]:
         """Return the names of entry points that are not used, each with a line that says why: others have the name."""
@@ -330,7 +332,9 @@ def engine_of(name: str) -> str:
     """Return which engine computes or renders a plant, in a line; empty where there is none, or no such plant here."""
     try:
         entry = find_plant(name)
-        return "" if entry.engine is None else _told(entry.engine)
+        if entry.engine is None:
+            return ""
+        return _told(entry.engine)
     except (ConfigurationError, ImportError):
         return ""
 

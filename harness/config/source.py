@@ -127,7 +127,9 @@ def _origin(name: str) -> Path | None:
         return Path(file).resolve() if file else None
     if spec is None or not spec.origin:
         return None
-    return Path(spec.origin).resolve() if spec.has_location else Path(f"the built-in {name}")
+    if spec.has_location:
+        return Path(spec.origin).resolve()
+    return Path(f"the built-in {name}")
 
 
 def present_folder() -> Path:
@@ -236,7 +238,9 @@ def _libraries() -> tuple[str, ...]:
 def show(path: Path) -> str:
     """Return a path as a user reads it best: relative to the present folder where it lies below it."""
     here = present_folder()
-    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+    if path.is_relative_to(here):
+        return str(path.relative_to(here))
+    return str(path)
 
 
 def find_place(text: str) -> re.Match[str] | None:
@@ -287,7 +291,9 @@ def import_user_module(module: str) -> ModuleType:
 def digest_of_module(module: str) -> str:
     """Return the SHA-256 of the file of a module that is imported; empty where it has none."""
     file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+    if file.is_file():
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    return ""
 
 
 def neighbours(file: Path, root: Path) -> list[Path]:

@@ -221,7 +221,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
     @property
     def observation(self) -> Observation | None:
         """The present observation of the plant, as controllers get it; None before the first `reset`."""
-        return None if self._rollout is None else self._rollout.observation
+        if self._rollout is None:
+            return None
+        return self._rollout.observation
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -526,7 +528,9 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
     @property
     def observation(self) -> Observation | None:
         """The present observation of the plant, as controllers get it, with a leading axis; None before `reset`."""
-        return None if self._many is None else self._rollout.observation
+        if self._many is None:
+            return None
+        return self._rollout.observation
 
     def _observe(self) -> Floats32:
         return self._spaces.observe(

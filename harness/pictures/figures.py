@@ -210,7 +210,9 @@ def _sample(kind: str, group: Group) -> str:
     if how == EACH:
         return count
     words = f"median of {count}, band: the middle 80 %"
-    return f"{words}; errors in features of seed {group.seed}" if kind == "tracking" else words
+    if kind == "tracking":
+        return f"{words}; errors in features of seed {group.seed}"
+    return words
 
 
 def _plans(

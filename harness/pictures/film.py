@@ -369,7 +369,9 @@ def _trails(run: LoggedRun, k: int) -> list[Trail]:
 
 
 def _desired(run: LoggedRun) -> str:
-    return "target" if run.track.point_to_point else "desired path"
+    if run.track.point_to_point:
+        return "target"
+    return "desired path"
 
 
 def snapshot_instants(ball: FloatArray, count: int) -> list[int]:
@@ -413,7 +415,9 @@ def _lap(run: LoggedRun) -> int:
         return last
     back = np.flatnonzero(distance <= CLOSED * distance.max())
     returned = back[back > away[0]]
-    return int(returned[0]) if len(returned) else last
+    if len(returned):
+        return int(returned[0])
+    return last
 
 
 def _title(run: LoggedRun) -> str:

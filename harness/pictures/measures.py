@@ -224,13 +224,17 @@ def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: Met
 
 def _time_in_words(time: float) -> str:
     """Return a time [ms] with its unit; a time that rounds to less than 1 ms in µs."""
-    return f"{1e3 * time:.0f} µs" if time < 0.9995 else f"{time:.3g} ms"
+    if time < 0.9995:
+        return f"{1e3 * time:.0f} µs"
+    return f"{time:.3g} ms"
 
 
 def _label(column: str, runs: pd.DataFrame) -> str:
     """Return the label of an axis, which has a unit in any case."""
     heading = comparison.metric_heading(column, runs)
-    return heading if heading.endswith("]") else f"{heading} [1]"
+    if heading.endswith("]"):
+        return heading
+    return f"{heading} [1]"
 
 
 def _moves(runs: pd.DataFrame) -> pd.Series[bool]:

@@ -309,12 +309,16 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
 
 def _largest(errors: FloatArray) -> float | None:
     """Return the largest known error for JSON, None where none is finite."""
-    return rounded(float(np.nanmax(errors))) if np.isfinite(errors).any() else None
+    if np.isfinite(errors).any():
+        return rounded(float(np.nanmax(errors)))
+    return None
 
 
 def rounded(value: float) -> float | None:
     """Return a number with few digits for JSON, None where it is not finite."""
-    return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
+    if np.isfinite(value):
+        return float(f"{value:.{DIGITS}g}")
+    return None
 
 
 def _view(title: str, tracks: Tracks) -> Json:
@@ -392,7 +396,9 @@ def _size(columns: int) -> str:
     """Return the word for a number of columns, as the page's style knows it."""
     if columns <= PHONE_COLUMNS:
         return "few"
-    return "some" if columns <= TABLET_COLUMNS else "many"
+    if columns <= TABLET_COLUMNS:
+        return "some"
+    return "many"
 
 
 def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table

@@ -122,7 +122,9 @@ class Track(Shown):
 
     def for_path(self) -> Self:
         """Return the rows that show the path in space: of a curve that is followed for long, the end."""
-        return self.overview() if self.point_to_point else self.closing()
+        if self.point_to_point:
+            return self.overview()
+        return self.closing()
 
     def error(self) -> FloatArray:
         """Return the norm of the true error, (k,) [`error_unit`]."""
@@ -233,7 +235,9 @@ class Ensemble(Shown):
     @property
     def period(self) -> float:
         """Control period [s]; NaN of a run of one period."""
-        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else math.nan
+        if len(self.time) > 1:
+            return float(self.time[1] - self.time[0])
+        return math.nan
 
     @property
     def shown_error(self) -> FloatArray:

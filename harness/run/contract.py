@@ -227,4 +227,6 @@ def _kind(value: object) -> str:
         return f"ndarray of shape {value.shape}"
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    return "None" if value is None else type(value).__name__
+    if value is None:
+        return "None"
+    return type(value).__name__

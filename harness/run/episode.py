@@ -147,7 +147,9 @@ def _judge_together(
 def _judge(logged: Steps, experiment: Experiment) -> dict[str, FloatArray]:
     """Return the metrics of a run or of runs side by side; none without rows."""
     task = experiment.scenario
-    return judge_run(logged, task.kind, task.evaluate_from, task.lap_time) if len(logged) else {}
+    if len(logged):
+        return judge_run(logged, task.kind, task.evaluate_from, task.lap_time)
+    return {}
 
 
 def _row(

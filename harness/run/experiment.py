@@ -238,7 +238,9 @@ class Experiment:
         return self._in_lanes([each.scenario.reference.sampled(period, rows) for each in self.runs])
 
     def _in_lanes(self, arrays: list[FloatArray]) -> FloatArray:
-        return np.stack(arrays) if self.together else arrays[0]
+        if self.together:
+            return np.stack(arrays)
+        return arrays[0]
 
 
 @same_folder()

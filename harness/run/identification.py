@@ -291,7 +291,9 @@ class Identified:
 
 def kind_of(name: str) -> str:
     """Return the beginning of a parameter's name, by which it has its unit and its prior."""
-    return "camera_turn" if name.startswith("camera_turn") else name.partition("_")[0]
+    if name.startswith("camera_turn"):
+        return "camera_turn"
+    return name.partition("_")[0]
 
 
 def prior(name: str) -> float:

@@ -80,7 +80,9 @@ def network_source(knowledge: RobotKnowledge, progress: Progress | None) -> Netw
     """Return the source of networks that are trained on a nominal model, in natural units; None where none is known."""
     natural = in_natural_units(knowledge)
     J = natural.nominal_jacobian
-    return None if J is None else NetworkSource(J, natural.spec, progress)
+    if J is None:
+        return None
+    return NetworkSource(J, natural.spec, progress)
 
 
 def keep_networks(networks: Iterable[TrainedNetworks], folder: Path) -> None:

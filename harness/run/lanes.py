@@ -74,7 +74,9 @@ class Ends:
             spread[self.running] = values
             return spread
 
-        return tree if len(self.running) == self.count else map_arrays(placed, tree, before)
+        if len(self.running) == self.count:
+            return tree
+        return map_arrays(placed, tree, before)
 
 
 @final

@@ -224,7 +224,9 @@ def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _peak(run: Judged, values: FloatArray) -> FloatArray:
-    return np.asarray(np.abs(values).max(axis=(-2, -1))) if values.size else run.same(np.nan)
+    if values.size:
+        return np.asarray(np.abs(values).max(axis=(-2, -1)))
+    return run.same(np.nan)
 
 
 def _rms(run: Judged, values: FloatArray) -> FloatArray:

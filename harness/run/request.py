@@ -224,12 +224,16 @@ def _in_name(varied: tuple[str, Value]) -> str:
     key, value = varied
     for name, short in SHORT_NAMES.items():
         if short.key == key and isinstance(value, int | float):
-            return "" if value == short.usual else f"-{name}{short.scale * value:.12g}{short.unit}"
+            if value == short.usual:
+                return ""
+            return f"-{name}{short.scale * value:.12g}{short.unit}"
     return f"-{key}={value}"
 
 
 def _frozen(value: Value | list[Value]) -> Value:
-    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        return tuple(map(_frozen, value))
+    return value
 
 
 def read_mismatch(text: str) -> Mismatch:
@@ -319,13 +323,17 @@ def _find(word: str, file: SourceFile | None) -> Sensing:
 def sensing_file(word: str) -> SourceFile | None:
     """Return the file of a user's own set-up; None for one of this package."""
     found = find_place(sensing_place(word))
-    return SourceFile.read(found["file"]) if found is not None and found["file"] else None
+    if found is not None and found["file"]:
+        return SourceFile.read(found["file"])
+    return None
 
 
 def sensing_place(word: str) -> str:
     """Return a word without its mount."""
     place, _, mount = word.rpartition(":")
-    return place if mount in (FIXED, HAND) else word
+    if mount in (FIXED, HAND):
+        return place
+    return word
 
 
 def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:

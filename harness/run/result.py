@@ -137,7 +137,9 @@ def _behind(error: BaseException) -> BaseException:
     while isinstance(behind, ConfigurationError) and behind.__cause__ is not None:
         behind = behind.__cause__
     files = (frame.f_code.co_filename for frame, _ in traceback.walk_tb(behind.__traceback__))
-    return behind if any(map(is_users, files)) else error
+    if any(map(is_users, files)):
+        return behind
+    return error
 
 
 def _place(error: BaseException) -> _Place | None:
@@ -170,7 +172,9 @@ def _beginning(method: Callable[..., Any]) -> _Place | None:
     """Return where a method is defined; None for one without source."""
     function = inspect.unwrap(getattr(method, "__func__", method))
     code = getattr(function, "__code__", None)
-    return _Place(code.co_filename, code.co_firstlineno, code.co_qualname) if code else None
+    if code:
+        return _Place(code.co_filename, code.co_firstlineno, code.co_qualname)
+    return None
 
 
 def _trace(error: BaseException) -> str:

@@ -69,7 +69,9 @@ class TaskSetting:
     @property
     def m(self) -> int:
         """Size of a place, in which tasks give targets and curves."""
-        return len(self.feature.names) if self.model is None else 3
+        if self.model is None:
+            return len(self.feature.names)
+        return 3
 
     def followed(self, curve: Reference) -> Reference:
         """Return the desired features of a ball on a curve of places: the curve itself where features are places."""
@@ -102,7 +104,9 @@ class TaskSetting:
 
     def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
         """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
-        return None if self.model is None else as_array("start", joint_position, (self.n,))
+        if self.model is None:
+            return None
+        return as_array("start", joint_position, (self.n,))
 
     def move(self, start: Vector | FloatArray, target: Reference, duration: float) -> Scenario:
         """Return a move to a fixed target, of which the last quarter is judged."""

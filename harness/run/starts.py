@@ -106,7 +106,9 @@ def drawn_together(
     for tenths in range(10, 0, -1):
         both = home + 0.1 * tenths * (np.stack([start, target]) - home)
         if _in_view(both, nominal, true).all():
-            return (start, target) if tenths == 10 else (both[0], both[1])
+            if tenths == 10:
+                return (start, target)
+            return (both[0], both[1])
     remedy = "use another mismatch"
     if robot.camera:
         remedy = f"look at [pose] in {robot.camera.name}, whose z axis is the optical axis"

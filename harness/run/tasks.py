@@ -352,4 +352,6 @@ def fitted(name: str, robot: Robot) -> Task:
         ConfigurationError: no such task.
     """
     default = find_task(name).default
-    return default if robot.name == DEFAULT_ROBOT else default.scaled(name, robot.workspace)
+    if robot.name == DEFAULT_ROBOT:
+        return default
+    return default.scaled(name, robot.workspace)

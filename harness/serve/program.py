@@ -69,7 +69,9 @@ def profile(
         short = max(0.0, min(t, duration - t))
         way = top * (short - rise / 2.0) if short > rise else acceleration * short * short / 2.0
         share = way / distance if distance > 0.0 else 0.0
-        return share if 2.0 * t < duration else 1.0 - share
+        if 2.0 * t < duration:
+            return share
+        return 1.0 - share
 
     return duration, done
 

@@ -199,7 +199,9 @@ def _faster(tables: Tables, plant: str) -> Answer:
 def _time_in_words(measurement: Measurement) -> str:
     """Return a settling time with its unit, or a word where half of the runs or more never settle."""
     time = measurement.estimate.value
-    return f"{time:.2f} s" if isfinite(time) else "never"
+    if isfinite(time):
+        return f"{time:.2f} s"
+    return "never"
 
 
 def _overshoot_and_path(tables: Tables, plant: str) -> Answer:

@@ -185,7 +185,9 @@ class PlantSetup:
     @property
     def limits(self) -> JointLimits | None:
         """The maker's joint limits, where they are known."""
-        return None if self.nominal is None else self.nominal.limits
+        if self.nominal is None:
+            return None
+        return self.nominal.limits
 
     def robot(self) -> tuple[RobotModel, FloatArray]:
         """Return model and start, (..., n), for a plant that needs them.

@@ -119,7 +119,9 @@ def fault(folder: Path, name: str, sums: Sums | None) -> str | None:
         return "is cut off"
     if sums is None:
         return None
-    return "was changed since it was written" if name in sums else f"is not listed in {SUMS}"
+    if name in sums:
+        return "was changed since it was written"
+    return f"is not listed in {SUMS}"
 
 
 def digest(path: Path) -> str:

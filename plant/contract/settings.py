@@ -129,7 +129,9 @@ def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
         raise PydanticCustomError("extent", "a number of metres or a text such as '2px'")
     if number < 0.0:
         raise PydanticKnownError("greater_than_equal", {"ge": 0.0})
-    return f"{number:g}px" if isinstance(value, str) else float(number)
+    if isinstance(value, str):
+        return f"{number:g}px"
+    return float(number)
 
 
 def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - as read from a file
@@ -264,7 +266,9 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a remedy to follow a list of known words: the nearest one; nothing if none is like `word`."""
     near = nearest(word, known)
-    return f"; did you mean {near!r}?" if near else ""
+    if near:
+        return f"; did you mean {near!r}?"
+    return ""
 
 
 def listed(names: Sequence[str], most: int = MAX_LISTED) -> str:
@@ -445,7 +449,9 @@ def _in_own_unit(name: str, written: object, unit: Callable[[], str]) -> object:
     except ValueError as error:
         raise ValueError(f"{name} must be {error}, got {written!r}") from None
     # A whole number passes a check for whole numbers as well.
-    return int(in_own) if in_own.is_integer() else in_own
+    if in_own.is_integer():
+        return int(in_own)
+    return in_own
 
 
 def _usual(hint: Any) -> Usual | None:  # noqa: ANN401 - any annotation
@@ -483,7 +489,9 @@ def likely_meant(
 
 def native(value: Any) -> Any:  # noqa: ANN401 - anything that a user gave
     """Return a number or text of numpy as one of Python, whose representation in a message is the number or text."""
-    return value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
 
 
 def describe(

@@ -346,7 +346,9 @@ class Instance3(Instance):
             raise FmuError(
                 f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s"
             )
-        return self._last_time.value if self._early.value else None
+        if self._early.value:
+            return self._last_time.value
+        return None
 
     def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
         return pointer, ctypes.c_size_t(size)

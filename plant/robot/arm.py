@@ -143,7 +143,9 @@ class SerialArm:
         poses[0] = turned[0]
         for before, step, pose in zip(poses, steps, poses[1:], strict=False):
             np.matmul(before, step, out=pose)
-        return np.moveaxis(poses, 0, -3) if lead else poses
+        if lead:
+            return np.moveaxis(poses, 0, -3)
+        return poses
 
     def ball_position(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for joint positions (..., n) in rad."""

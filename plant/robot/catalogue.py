@@ -175,7 +175,9 @@ def _read_twin_robot(path: Path, values: Mapping[str, Any]) -> Robot:
 
     def locate(file: str) -> str:
         beside = path.parent / file
-        return str(beside) if beside.is_file() else file
+        if beside.is_file():
+            return str(beside)
+        return file
 
     named = with_files(str(values["robot"]), locate, lambda file: is_file(locate(file)))
     base = user_path(read_word(named).robot)

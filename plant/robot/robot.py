@@ -89,7 +89,9 @@ class Robot:
     @property
     def pinhole(self) -> PinholeCamera:
         """Size and focal length of the image as planned."""
-        return CAMERA if self.camera is None else self.camera.pinhole
+        if self.camera is None:
+            return CAMERA
+        return self.camera.pinhole
 
     def equipped(self, camera: OwnCamera) -> Self:
         """Return the robot with a camera and a target of the user."""

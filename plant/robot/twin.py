@@ -207,7 +207,9 @@ class Twin:
 
         def with_unit(size: float) -> float | str:
             """A setting without a unit is in metres."""
-            return size if keys.sensing == "position" else f"{size}px"
+            if keys.sensing == "position":
+                return size
+            return f"{size}px"
 
         sensing: dict[str, Any] = {
             "drop_probability": keys.lost_frames,

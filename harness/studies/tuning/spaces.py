@@ -414,7 +414,9 @@ def inside(space: Space, values: Point, otherwise: Point) -> Point:
 
 def _within(distribution: Distribution, value: Any, otherwise: Any) -> Any:  # noqa: ANN401 - a number or a choice
     if isinstance(distribution, CategoricalDistribution):
-        return value if value in distribution.choices else otherwise
+        if value in distribution.choices:
+            return value
+        return otherwise
     within = min(max(value, distribution.low), distribution.high)
     if distribution.step is None:
         return within
