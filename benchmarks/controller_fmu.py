@@ -14,11 +14,11 @@ from measuring import asked_to_be_quick, microseconds, processor_time, table
 from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
 from servobench.fmus.compiler import this_platform
+from servobench.harness.apps.fmu.products import controller_model
 from servobench.harness.config.entries import NoSettings
 from servobench.harness.config.fmu_controller import mapped_controller
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
-from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.signals import Command

@@ -11,11 +11,11 @@ import pandas as pd
 
 import servobench
 from measuring import options
+from servobench.harness.apps.twin.drive import command_response
+from servobench.harness.apps.twin.identification import read_log
+from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.drive import command_response
 from servobench.harness.run.experiment import build, draw_robot
-from servobench.harness.run.identification import read_log
-from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.resolution import resolve
 from servobench.plant.robot.catalogue import ROBOTS, find_robot

@@ -19,9 +19,9 @@ from hidden_plants import draw_hidden
 
 import servobench
 from measuring import options
+from servobench.harness.apps.twin.identification import read_log
+from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.batch.logs import logged_in_file
-from servobench.harness.run.identification import read_log
-from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import find_sensing
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.catalogue import ROBOTS, find_robot

@@ -25,22 +25,22 @@ from hidden_plants import draw_hidden, parameters
 
 import servobench
 from measuring import options
-from servobench.harness.config.description import toml
-from servobench.harness.config.settings import Settings, flatten, nest
-from servobench.harness.run.drive import command_response
-from servobench.harness.run.experiment import build, draw_robot
-from servobench.harness.run.identification import read_log
-from servobench.harness.run.preflight import mistakes
-from servobench.harness.run.request import SHORT_NAMES, RunRequest, find_sensing, read_mismatch
-from servobench.harness.run.resolution import resolve
-from servobench.harness.run.twin_file import twin_text
-from servobench.harness.studies.challenge import (
+from servobench.harness.apps.studies.challenge import (
     MEASURES,
     Challenge,
     challenge_names,
     find_challenge,
 )
-from servobench.harness.studies.suite import judge
+from servobench.harness.apps.studies.suite import judge
+from servobench.harness.apps.twin.drive import command_response
+from servobench.harness.apps.twin.identification import read_log
+from servobench.harness.apps.twin.preflight import mistakes
+from servobench.harness.apps.twin.twin_file import twin_text
+from servobench.harness.config.description import toml
+from servobench.harness.config.settings import Settings, flatten, nest
+from servobench.harness.run.experiment import build, draw_robot
+from servobench.harness.run.request import SHORT_NAMES, RunRequest, find_sensing, read_mismatch
+from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
 from servobench.plant.robot.mechanics import MECHANICS_AXES

@@ -17,11 +17,12 @@ import pytest
 from hypothesis import settings
 
 SLOW = {  # folders and files whose tests are all slow
-    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_chain", "test_check", "test_drives",
-    "test_engine", "test_exit_codes", "test_fmu_model", "test_fmu_standard", "test_fmu_symbolic", "test_help",
-    "test_integrity", "test_lists", "test_loops", "test_outcome", "test_page_tables", "test_plant_lanes",
-    "test_robot_runs", "test_robots", "test_sensing_runs", "test_setups", "test_units", "test_urdf", "test_verdict",
-    "test_wrong_inputs",
+    "closed_loop", "end_to_end", "films", "report", "tuning", "test_adapters", "test_analyse", "test_blocks",
+    "test_chain", "test_check", "test_claims", "test_controller_fmu", "test_drives", "test_engine",
+    "test_environments", "test_exit_codes", "test_fmu_model", "test_fmu_standard", "test_fmu_symbolic", "test_help",
+    "test_integrity", "test_lists", "test_loops", "test_on_a_ur", "test_outcome", "test_page_tables",
+    "test_plant_lanes", "test_robot_runs", "test_robots", "test_sensing_runs", "test_served_browser", "test_setups",
+    "test_stability_limits", "test_units", "test_urdf", "test_verdict", "test_wrong_inputs",
 }  # fmt: skip
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.

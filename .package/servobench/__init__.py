@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from servobench.controllers.aids import EQUIPPED
     from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+    from servobench.harness.apps.check.controllers import check_controller
+    from servobench.harness.apps.check.plants import check_plant
     from servobench.harness.batch.api import Results, compare, load, run
-    from servobench.harness.check.controllers import check_controller
-    from servobench.harness.check.plants import check_plant
     from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting
     from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
     from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
@@ -51,8 +51,8 @@ _HOMES = {
     "servobench.controllers.aids": ("EQUIPPED",),
     "servobench.controllers.controller": ("Controller", "ControllerEntry", "RobotKnowledge"),
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
-    "servobench.harness.check.controllers": ("check_controller",),
-    "servobench.harness.check.plants": ("check_plant",),
+    "servobench.harness.apps.check.controllers": ("check_controller",),
+    "servobench.harness.apps.check.plants": ("check_plant",),
     "servobench.harness.run.scenario": ("Scenario", "Task", "TaskEntry", "TaskSetting"),
     "servobench.plant.bench.plant": ("Plant", "PlantEntry", "PlantSetup", "World"),
     "servobench.plant.contract.signals": ("Command", "Observation", "PlantSpec", "Truth"),

@@ -57,7 +57,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
         ("harness/test_metrics.py", "harness/test_metrics_oracle.py", "harness/test_page_tables.py"),
     ),
     "statistics": (
-        ("harness/analysis/comparison.py", "harness/analysis/scores.py"),
+        ("harness/analysis/comparison.py", "harness/apps/studies/scores.py"),
         ("harness/test_statistics.py", "harness/test_scores.py", "harness/test_verdict.py", "harness/test_tables.py",
          "harness/test_page_tables.py"),
     ),

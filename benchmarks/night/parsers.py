@@ -30,6 +30,7 @@ from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.analysis.folder import describe_folder, describe_settings
 from servobench.harness.analysis.tables import statistics_tables
+from servobench.harness.apps.tuning.objective import Ledger
 from servobench.harness.batch import results
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, current_holder, locked
@@ -40,7 +41,6 @@ from servobench.harness.run.references import read_waypoints
 from servobench.harness.run.request import RunRequest, find_robot, read_mismatch
 from servobench.harness.run.resolution import check_settings, resolve
 from servobench.harness.run.result import RunResult
-from servobench.harness.studies.tuning.objective import Ledger
 from servobench.plant.contract import cache as entries
 from servobench.plant.contract import checksums
 from servobench.plant.contract.checksums import SUMS

@@ -17,7 +17,7 @@ from contextlib import suppress
 
 from kit.served import SPEED, Bytes, packed, served
 from measuring import options
-from servobench.harness.serve.server import PORTS
+from servobench.harness.apps.serve.server import PORTS
 
 NAMES = (
     *SPEED,

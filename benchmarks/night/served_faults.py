@@ -31,7 +31,7 @@ import numpy as np
 from kit.served import fresh_address, served, waited_for
 from measuring import options
 from night import served_client
-from servobench.harness.serve.server import PORTS
+from servobench.harness.apps.serve.server import PORTS
 
 LIMIT = 0.25  # [rad/s] of on_a_ur.py
 PERIOD = 25  # periods of the server in one of the controller

@@ -14,10 +14,10 @@ import numpy as np
 from fmpy.ssp.simulation import simulate_ssp
 
 from servobench.fmus.compiler import this_platform
-from servobench.fmus.ssp import write_loop
+from servobench.fmus.controllers.ssp import write_loop
+from servobench.harness.apps.fmu.products import loop_products
 from servobench.harness.batch.api import run
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.export import loop_products
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
 

@@ -15,9 +15,9 @@ import pandas as pd
 import stored_tables
 from page_studies import cells
 from page_studies.study import ENGINES, FIVE, RENDERED, Study, sweep
+from servobench.harness.apps.studies.claims import UNDECIDED
+from servobench.harness.apps.studies.reproduction import ANSWERS
 from servobench.harness.batch.results import load_runs
-from servobench.harness.studies.claims import UNDECIDED
-from servobench.harness.studies.reproduction import ANSWERS
 
 FIRST, SECOND = ENGINES
 PROFILES: Final = ("moderate", "lab")

@@ -9,10 +9,10 @@ from pathlib import Path
 from PIL import Image
 
 from page_studies.study import FIVE, Study
+from servobench.harness.apps.films.film import draw_frame
+from servobench.harness.apps.films.replay import logged_run
 from servobench.harness.batch import results
 from servobench.harness.pictures.figures import Choice, folder_figures
-from servobench.harness.pictures.film import draw_frame
-from servobench.harness.pictures.replay import logged_run
 from servobench.harness.pictures.style import drawing_of
 
 SHOWN = "circle"  # the task whose film gives a frame

@@ -11,8 +11,8 @@ from page_studies.cells import by_method, marked, quoted
 from page_studies.pictures import small
 from page_studies.study import ENGINES, FOUR, SUFFIX, Study, Words, on_engines
 from servobench.harness.analysis.comparison import is_majority, settling_times
+from servobench.harness.apps.studies.robustness import KNOWN_LINES
 from servobench.harness.batch.results import load_runs
-from servobench.harness.studies.robustness import KNOWN_LINES
 
 # Best equipped all stay above 90 % everywhere
 MAPPED = ("regression_mfac", *(name + SUFFIX for name in FOUR))

@@ -1,4 +1,4 @@
-"""Trials of the code of users in an isolated process: imported, built, checked or validated before it is relied on.
+"""Trials of the code of users in an isolated process: imported or built before it is relied on.
 
 Code that ends its process, hangs or leaks memory costs one line, with its place where that is known.
 """
@@ -7,26 +7,23 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
-from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, find_controller, installed_plant
 from servobench.harness.config.source import count_as_users, find_place, place_in_trace
 from servobench.harness.run.result import LOST, TIMED_OUT, Ending
-from servobench.plant.contract.faults import ConfigurationError, FmuError, configuration_errors
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
-    from servobench.fmus.inspection import Validation
     from servobench.harness.batch.isolation import Tell
 
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
 
 Word: TypeAlias = Literal["controller", "plant"]
-Checks: TypeAlias = Callable[..., Any]
 
 
 class Tried(NamedTuple):
@@ -183,59 +180,3 @@ def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
     except ConfigurationError as error:
         return Tried(name, fault=str(error))
     return Tried(name, str(entry.summary))
-
-
-def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Finding], None]) -> None:
-    """Carry checks out and hand over the findings; a check that ends or hangs the process is the last.
-
-    Args:
-        checks: `check_controller` or `check_plant`.
-        subject: the controller or plant, as text.
-        limit: [s] time limit of one check.
-        hear: receives the findings.
-
-    Raises:
-        ConfigurationError: the subject cannot be loaded.
-    """
-    current = ["loading"]  # the step before the first check
-
-    def receive(told: object) -> None:
-        match told:
-            case [str(check), "ok" | "failed" | "note" as verdict, str(text)]:
-                hear(Finding(check, verdict, text))
-            case str(check):
-                current.append(check)
-
-    _, failure = attempt(_check, checks, subject, limit=limit, hear=receive)
-    if failure:
-        hear(Finding(current[-1], "failed", failure))
-
-
-def _check(tell: Tell, checks: Checks, subject: str) -> None:
-    checks(subject, tell, lambda finding: tell(list(finding)))
-
-
-def validate(path: Path) -> Validation:
-    """Check the FMU at `path`; an FMU that ends its process has a problem.
-
-    Raises:
-        ConfigurationError: it is not a co-simulation FMU of FMI 2 or 3.
-    """
-    from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
-    from servobench.harness.batch.processes import FOREIGN_TIME  # noqa: PLC0415 - as above
-
-    answer, failure = attempt(
-        _validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False
-    )
-    match answer:
-        case [list(problems), list(departures), float() | None as deviation]:
-            return Validation(tuple(map(str, problems)), tuple(map(str, departures)), deviation)
-    return Validation((f"the reference run ended: {failure or 'it gave no answer'}",), (), None)
-
-
-def _validate(path: Path) -> tuple[Sequence[str], Sequence[str], float | None]:
-    from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
-
-    with configuration_errors("", FmuError):
-        found = validate_fmu(path)
-    return found.problems, found.departures, found.deviation

@@ -7,17 +7,15 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Annotated, Any, Final, NoReturn
 
 import typer
 import typer.main
 from rich.markup import escape
 
-from servobench.harness.cli import authoring, lists, results, runs, studies
-from servobench.harness.cli.films import record
-from servobench.harness.cli.fmu import fmu_app
-from servobench.harness.cli.options import ABSENT, command
+from servobench.harness.cli.applications import assemble
+from servobench.harness.cli.options import ABSENT
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED, ending_alike
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import harmless
@@ -34,43 +32,6 @@ COMPLETION_REQUEST: Final = (
 BASH: Final = "complete_bash"
 # At which bash splits a word, though names of methods and settings have them
 WORD_BREAKS: Final = frozenset(":=")
-PANELS: dict[
-    str, tuple[Callable[..., None], ...]
-] = {  # title -> commands, in the order of first use
-    "First steps": (
-        runs.run,
-        runs.compare,
-        results.statistics,
-        results.report,
-        results.figures,
-        record,
-    ),
-    "Your own controller": (
-        authoring.new,
-        authoring.check,
-        authoring.shadow,
-        authoring.identify,
-        authoring.serve,
-    ),
-    "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
-    "Studies": (
-        studies.sweep,
-        studies.analyse,
-        studies.robustness,
-        studies.suite,
-        studies.claims,
-        studies.tune,
-    ),
-    "Tools": (runs.train, results.collect, runs.merge, results.export, results.verify),
-}
-
-app = typer.Typer(
-    context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False
-)
-for title, functions in PANELS.items():
-    for function in functions:
-        app.command(rich_help_panel=title)(command(function))
-app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
 
 
 def _print_version(wanted: bool) -> None:
@@ -81,7 +42,6 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def servobench(
     _version: Annotated[
         bool,
@@ -95,14 +55,7 @@ def servobench(
 
 def command_line(called: str = "") -> Any:  # noqa: ANN401 - typer's own classes have no public name
     """Return the command with all subcommands, or with that which is called: typer takes long to build them all."""
-    only = [
-        each
-        for each in app.registered_commands
-        if each.callback and each.callback.__name__ == called
-    ]
-    part = typer.Typer(context_settings=app.info.context_settings, pretty_exceptions_enable=False)
-    part.registered_commands, part.registered_callback = only, app.registered_callback
-    root = typer.main.get_command(part if only else app)
+    root = typer.main.get_command(assemble(called, servobench))
     _hide_types(root)
     return root
 
@@ -206,7 +159,8 @@ def _carry_out(caught: list[int]) -> None:
 
 def _resuming() -> str:
     """Return how the command goes on after an error of the system, if it has finished runs to keep."""
-    called = command_line().commands.get("".join(sys.argv[1:2]))
+    name = "".join(sys.argv[1:2])
+    called = command_line(name).commands.get(name)
     kept = called is not None and any(option.name == "resume" for option in called.params)
     if kept:
         return "; finished runs are kept, --resume continues"

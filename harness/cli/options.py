@@ -44,9 +44,9 @@ class Value(NamedTuple):
         )
 
 
-PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH, CHALLENGE = (
+PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH = (
     Value("NAME", selection.completing(kind))
-    for kind in ("plants", "controllers", "estimators", "tasks", "mismatch", "challenges")
+    for kind in ("plants", "controllers", "estimators", "tasks", "mismatch")
 )
 ROBOT, SENSING = (
     Value("NAME", selection.completing(kind), partial(selection.choose, kind))

@@ -1,9 +1,8 @@
-"""The commands on results folders: `statistics | report | collect | export | verify`; the verdict on failed runs."""
+"""The commands on results folders: `statistics | figures | collect | export | verify`; the verdict on failed runs."""
 
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -25,7 +24,6 @@ from servobench.plant.contract.files import accessing, writing_together
 if TYPE_CHECKING:
     import pandas as pd
 
-SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
 MAX_SATURATED: Final = 0.8  # share of the periods
 MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
 
@@ -86,31 +84,6 @@ def statistics(
     else:
         print_tables(tables)
     say(describe_controllers(folder))
-
-
-def report(
-    folder: Annotated[
-        Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")
-    ],
-    out: Annotated[
-        Path | None, option("FILE", "The page; default: report.html in the folder.")
-    ] = None,
-) -> None:
-    """Write one page about a results folder.
-
-    With figures, sortable tables and paths to turn; it needs no network.
-    """
-    from servobench.harness.batch import results
-    from servobench.harness.pictures.report import write_report
-
-    say(results.describe_missing(folder))
-    began = time.monotonic()
-    with console.status("making the report"):
-        path = write_report(folder, out)
-        results.vouch(folder, [path])
-    seconds = time.monotonic() - began
-    took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
-    say(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})")
 
 
 def figures(

@@ -1,4 +1,4 @@
-"""The commands that carry runs out, `servobench run | compare`, and `merge` and `train`."""
+"""The commands that carry runs out, `servobench run | compare | sweep | merge | train`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
+from servobench.harness.cli.applications import find_command
 from servobench.harness.cli.options import (
     CONTROLLER,
     ESTIMATOR,
@@ -18,7 +19,7 @@ from servobench.harness.cli.options import (
     option,
     switch,
 )
-from servobench.harness.cli.results import judge, print_faults, report
+from servobench.harness.cli.results import judge, print_faults
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest
@@ -34,6 +35,10 @@ OutOption = Annotated[
 ]
 FiguresOption = Annotated[bool, switch("--figures/--no-figures", "Also draw the figures, as PNG.")]
 ReportOption = Annotated[bool, switch("--report/--no-report", "Also make the page report.html.")]
+
+SWEPT = options.Combinations(
+    controllers="rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid", tasks="random", seeds="10"
+)
 
 
 def run(
@@ -133,6 +138,59 @@ def compare(
     )
 
 
+def sweep(
+    *,
+    out: options.FolderOption,
+    combinations: options.Combinations = SWEPT,
+    vary: Annotated[
+        list[str] | None,
+        option(
+            "KEY=VALUES",
+            "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05.",
+        ),
+    ] = None,
+    noise: Annotated[
+        str, option("NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")
+    ] = "",
+    latency: Annotated[str, option("SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
+    period: Annotated[str, option("SECONDS", "Control periods [s]: --vary period=...")] = "",
+    running: options.Batched,
+    overrides: options.Overrides,
+) -> None:
+    """Run a Monte Carlo sweep: many runs, a row each.
+
+    No steps are kept. A sweep that was interrupted is continued with --resume.
+    """
+    from servobench.harness.analysis.comparison import MISSING
+    from servobench.harness.analysis.folder import describe_controllers
+    from servobench.harness.analysis.tables import SWEEP_COLUMNS, outcome_legend, sweep_tables
+    from servobench.harness.batch import results
+    from servobench.harness.batch.campaign import Campaign, carry_out
+    from servobench.harness.batch.plan import SweepPlan
+    from servobench.harness.cli.progress import watching
+    from servobench.harness.run.request import SECTIONS
+
+    short = {"noise": noise, "latency": latency, "period": period}
+    variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
+    campaign = Campaign(
+        SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings()
+    )
+    execution = running.execution()
+    with watching(console, out, execution) as how:
+        carry_out(campaign, out, how)
+    columns = (
+        *SWEEP_COLUMNS,
+        *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)),
+    )
+    legend = (
+        f"{outcome_legend(results.iterate_runs(out, columns))}\n{MISSING} as configured".lstrip()
+    )
+    print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
+    say(describe_controllers(out))
+    say(f"table in {out / results.RUNS}")
+    judge(out, strict=running.strict, whole=execution.part == (1, 1))
+
+
 def merge(
     folders: Annotated[
         list[Path], typer.Argument(help="Results folders of the parts of a batch, of --part.")
@@ -227,7 +285,7 @@ def _carry_out(
         )
         if with_report:
             try:
-                report(folder)
+                find_command("report")(folder)
             except (
                 ConfigurationError,
                 ImportError,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from servobench.harness.cli.terminal import say
 from servobench.plant.contract.faults import ConfigurationError
@@ -32,12 +32,17 @@ class Names(NamedTuple):
     )
 
 
+Kind: TypeAlias = str | Callable[[], Names]  # a word of `names_of`, or names of an application
+
+
 @cache
-def names_of(kind: str) -> Names:
-    """Return the names of a kind: plants, controllers, estimators, tasks, challenges and so on.
+def names_of(kind: Kind) -> Names:
+    """Return the names of a kind: plants, controllers, estimators, tasks and so on.
 
     It imports no more than its kind needs, as shells wait for completions.
     """
+    if not isinstance(kind, str):
+        return kind()
     match kind:
         case "plants":
             from servobench.harness.config.registry import plant_names
@@ -70,10 +75,6 @@ def names_of(kind: str) -> Names:
             from servobench.harness.run.request import find_sensing, sensing_names
 
             return Names(sensing_names, find_sensing)
-        case "challenges":
-            from servobench.harness.studies.challenge import challenge_names, find_challenge
-
-            return Names(challenge_names, find_challenge)
     raise ValueError(f"kind must be plants, controllers or another kind of names, got {kind!r}")
 
 
@@ -108,7 +109,7 @@ def _choose(word: Word, given: str) -> str:
     return choose(word, given)
 
 
-def completing(kind: str) -> Callable[[str], list[str]]:
+def completing(kind: Kind) -> Callable[[str], list[str]]:
     """Return a function that completes a name of a kind."""
 
     def complete(incomplete: str) -> list[str]:
@@ -136,7 +137,7 @@ def _matching(incomplete: str, names: Iterable[str]) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
-def choose(kind: str, word: str) -> str:
+def choose(kind: Kind, word: str) -> str:
     """Return the name of a kind that a user named, or whose place was given; a wrong one is refused."""
     names = names_of(kind)
     if len(split_words(word, names.known())) > 1:
@@ -148,7 +149,7 @@ def choose(kind: str, word: str) -> str:
     return name
 
 
-def split(kind: str, text: str, *, option: str = "", robot: str = "ur5") -> tuple[str, ...]:
+def split(kind: Kind, text: str, *, option: str = "", robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of a kind in a comma-separated list, each looked up.
 
     Args:
@@ -170,7 +171,7 @@ def split(kind: str, text: str, *, option: str = "", robot: str = "ur5") -> tupl
                 sys.stderr.write(f"servobench: left out: {each.fault}\n")
         return [each.name for each in found if not each.fault]
 
-    chosen = split_names(option or kind, text, names.known(), names.find, usable)
+    chosen = split_names(option or str(kind), text, names.known(), names.find, usable)
     _tell_unused(names, split_words(text, names.known()))
     return chosen
 

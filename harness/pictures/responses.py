@@ -6,7 +6,7 @@
 | 5 | paths of these moves in space | `servobench.harness.pictures.paths` |
 | 6 | a tracked curve: error, desired and measured features | `draw_tracking` |
 | 7 | the tracked curve in space | `servobench.harness.pictures.paths` |
-| 8 | the arm at eight places on the circle | `servobench.harness.pictures.film` |
+| 8 | the arm at eight places on the circle | `servobench.harness.apps.films.film` |
 """
 
 import math

@@ -9,7 +9,7 @@ import pytest
 
 import servobench
 from servobench.controllers.aids import EQUIPPED, describe_aids
-from servobench.harness.check.rig import Driver, Rig
+from servobench.harness.apps.check.rig import Driver, Rig
 from servobench.harness.config.entries import CONTROLLER
 from servobench.harness.config.settings import Settings, flatten
 from servobench.plant.contract.faults import ConfigurationError

@@ -19,8 +19,8 @@ from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, PUBLISHED,
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
 from servobench.controllers.networks.fit import train
 from servobench.controllers.servo import ServoController
-from servobench.harness.check.controllers import ControllerChecks
-from servobench.harness.check.report import report
+from servobench.harness.apps.check.controllers import ControllerChecks
+from servobench.harness.apps.check.report import report
 from servobench.harness.config.settings import default_config
 from servobench.plant.contract.signals import Observation
 

@@ -32,7 +32,8 @@ from kit.documents import (
 from kit.foreign_fmu import build_crane
 from kit.own import install
 from servobench.controllers.methods import ESTIMATORS, LAWS
-from servobench.harness.cli.main import app
+from servobench.harness.cli.applications import assemble
+from servobench.harness.cli.main import servobench as first_options
 from servobench.harness.config import registry
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.episode import run_experiment
@@ -267,7 +268,8 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
 def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     made = CliRunner().invoke(
-        app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2", "--no-figures"]
+        assemble("run", first_options),
+        ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2", "--no-figures"],
     )
     assert made.exit_code == 0, made.output
     (tmp_path / "first").symlink_to("results/latest")

@@ -8,13 +8,12 @@ import shlex
 from contextlib import nullcontext, suppress
 
 import pytest
-import typer
 
 from kit.command import servobench
 from kit.documents import FENCED, PAGES, ROOT
 from kit.own import CONFIGURED, write
 from servobench.harness.batch import campaign
-from servobench.harness.cli.main import app
+from servobench.harness.cli.main import command_line
 from servobench.harness.config.registry import default_plant
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -79,7 +78,7 @@ def test_the_pages_show_every_command():
 @pytest.mark.parametrize("words", LINES)
 def test_every_line_is_one_that_the_command_line_reads(words):
     own = any(name in word for word in words for name in OWN)
-    command = typer.main.get_command(app)
+    command = command_line()
     context = command.make_context("servobench", list(words))
     while hasattr(command, "resolve_command"):
         name, command, rest = command.resolve_command(

@@ -23,6 +23,7 @@ from kit.folders import (
     write_folder,
 )
 from servobench.harness.analysis.comparison import FROM_TWIN, split_tasks
+from servobench.harness.apps.report.page import path_views
 from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures import style
@@ -34,7 +35,6 @@ from servobench.harness.pictures.figures import (
     page_figures,
 )
 from servobench.harness.pictures.measures import draw_conditions
-from servobench.harness.pictures.report import path_views
 from servobench.harness.pictures.style import (
     ENDED,
     NARROW,

@@ -21,11 +21,11 @@ from kit.own import write
 from page_studies import STUDIES, cells, held_out, physical, pictures, worlds
 from page_studies.pictures import README
 from page_studies.study import ENGINES, Study, nothing, sweep
+from servobench.harness.apps.studies import robustness
 from servobench.harness.batch import results
 from servobench.harness.batch.plan import TUNING, Batch, SweepPlan, parse_seeds
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.resolution import resolve_sections, select
-from servobench.harness.studies import robustness
 
 TRIED = ("--set", "random.duration=0.5", "--workers", "1")
 

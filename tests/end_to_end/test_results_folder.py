@@ -17,11 +17,11 @@ import pytest
 
 from kit.command import finish, judged, part_count, servobench, start, wait_for
 from night import file_faults
+from servobench.harness.apps.tuning.objective import Ledger
 from servobench.harness.batch import campaign, lock, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.studies.tuning.objective import Ledger
 from servobench.plant.contract.faults import ConfigurationError
 
 SWEEP = (

@@ -81,7 +81,7 @@ def test_an_arm_is_the_same_as_fmu_and_in_numpy(name, request):
 @NEEDS_BULLET
 @pytest.mark.parametrize("name", ["panda", "ur10e"])
 def test_a_rendered_arm_settles_and_can_be_shown(name, request):
-    from servobench.harness.pictures.replay import Replay, logged_run
+    from servobench.harness.apps.films.replay import Replay, logged_run
 
     robot = name if name == "panda" else request.getfixturevalue(name)
     result = run_experiment(

@@ -8,15 +8,15 @@ import pytest
 
 import servobench as package
 from kit.lanes import assert_rows_of_single_runs
+from servobench.harness.apps.films.replay import logged_run
+from servobench.harness.apps.studies.challenge import find_challenge
 from servobench.harness.batch.results import read_manifest
 from servobench.harness.config.settings import Settings
-from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run import starts
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
-from servobench.harness.studies.challenge import find_challenge
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.kinematic import ENTRY as KINEMATIC
 

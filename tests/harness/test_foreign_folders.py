@@ -134,7 +134,7 @@ def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     # Those of `figures`
-    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])
+    monkeypatch.setattr("servobench.harness.apps.report.page.report_pictures", lambda *_: [])
     allowed = [
         os.path.realpath(tmp_path / name) for name in ("home/folder", "temporary", "cache", "out")
     ]
@@ -360,7 +360,7 @@ def test_an_odd_folder_is_read_or_refused_in_one_line(kind, tmp_path, monkeypatc
     make, command, code, words = ODD[kind]
     monkeypatch.chdir(tmp_path)
     # Which take seconds
-    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])
+    monkeypatch.setattr("servobench.harness.apps.report.page.report_pictures", lambda *_: [])
     make(
         comparison(
             tmp_path / "folder",

@@ -8,7 +8,9 @@ import typer.main
 from typer.testing import CliRunner
 
 from kit.command import python, servobench
-from servobench.harness.cli.main import PANELS, app, command_line, in_known_number
+from servobench.harness.cli.applications import PANELS, assemble
+from servobench.harness.cli.main import command_line, in_known_number
+from servobench.harness.cli.main import servobench as first_options
 from servobench.harness.cli.options import ABSENT, Value, command, named_option
 
 ROOT = command_line()
@@ -64,10 +66,10 @@ def test_a_terminal_of_no_width_and_one_of_few_letters_print_all_words():
 def test_no_word_in_brackets_is_taken_for_markup(output_of, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
     assert "a [section] for each" in output_of("run", "--help")
-    written = typer.main.get_command(app).commands
+    written = typer.main.get_command(assemble("", first_options)).commands
     for name in PANELS["First steps"] + PANELS["Studies"]:
-        text = output_of(name.__name__, "--help")
-        for each in written[name.__name__].params:
+        text = output_of(name, "--help")
+        for each in written[name].params:
             for words in re.findall(r"\[.*?\]", each.help or ""):
                 assert words in text
 

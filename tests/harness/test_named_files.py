@@ -7,11 +7,11 @@ import pytest
 
 import servobench
 from kit.own import CELL, WHOLE
+from servobench.harness.apps.tuning.objective import TuningSet, open_ledger
 from servobench.harness.batch.manifest import named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import choose_plant, offering
 from servobench.harness.config.source import neighbours
-from servobench.harness.studies.tuning.objective import TuningSet, open_ledger
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import ur5
 

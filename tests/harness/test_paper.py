@@ -101,7 +101,7 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
         "exp2 on kinematic, drawn from the twin"
     ]
     pytest.importorskip("cv2")
-    from servobench.harness.pictures import film, replay
+    from servobench.harness.apps.films import film, replay
 
     shown = replay.logged_run(load_runs(out).to_dict("records")[0], load_steps(out))
     assert film._title(shown).endswith("mismatch drawn from the twin, seed 0")

@@ -27,12 +27,12 @@ from servobench.harness.analysis.tables import (
     summary_tables,
 )
 from servobench.harness.analysis.verdict import judge, leaders
+from servobench.harness.apps.report.page import error_curves, path_views
 from servobench.harness.batch import results, tables
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.tables import NEEDED
 from servobench.harness.cli.runs import new_folder
 from servobench.harness.pictures.measures import draw_conditions
-from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
@@ -454,7 +454,7 @@ def unfinished(tmp_path, monkeypatch):
     """The folder `out` below the working directory, with two of three runs; reports on it have no pictures."""
     monkeypatch.chdir(tmp_path)
     # Which take seconds
-    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])
+    monkeypatch.setattr("servobench.harness.apps.report.page.report_pictures", lambda *_: [])
     results.create_folder(Path("out"), {"run_count": 3})
     for index in range(2):
         add_part(Path("out"), index)

@@ -9,14 +9,14 @@ import pytest
 from kit.lanes import assert_rows_of_single_runs
 from kit.plants import NEEDS_MUJOCO
 from kit.robots import FOUR_JOINTS
+from servobench.harness.apps.films.replay import logged_run
+from servobench.harness.apps.fmu.products import arm_product, loop_products
 from servobench.harness.batch.manifest import describe_robot
 from servobench.harness.config import registry
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, default_config
-from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, train_networks
-from servobench.harness.run.export import arm_product, loop_products
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, fitted

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from servobench.fmus.compiler import this_platform
-from servobench.fmus.controller_export import ControllerModel
+from servobench.fmus.controllers.export import ControllerModel
+from servobench.harness.apps.fmu.products import controller_model
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import Experiment, build
-from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.cache import cached

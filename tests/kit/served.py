@@ -9,10 +9,10 @@ import threading
 import time
 from contextlib import contextmanager
 
+from servobench.harness.apps.serve.server import PORTS, Server
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.loop import careful
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.serve.server import PORTS, Server
 
 REQUEST = RunRequest("kinematic", "constant", "target", read_mismatch("moderate"), 0, robot="ur5e")
 # of speedJ, speedStop and moveJ, as ur-rtde has them

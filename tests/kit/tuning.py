@@ -4,17 +4,17 @@ import tomllib
 
 import numpy as np
 
-from servobench.harness.batch.blocks import open_workers
-from servobench.harness.config.settings import flatten
-from servobench.harness.studies.tuning import objective as scoring
-from servobench.harness.studies.tuning.campaign import (
+from servobench.harness.apps.tuning import objective as scoring
+from servobench.harness.apps.tuning.campaign import (
     TunedValues,
     TuningPlan,
     advance,
     open_methods,
 )
-from servobench.harness.studies.tuning.objective import TuningSet
-from servobench.harness.studies.tuning.spaces import StudyRecord
+from servobench.harness.apps.tuning.objective import TuningSet
+from servobench.harness.apps.tuning.spaces import StudyRecord
+from servobench.harness.batch.blocks import open_workers
+from servobench.harness.config.settings import flatten
 
 SMALL = TuningSet(robots=2)
 

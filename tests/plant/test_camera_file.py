@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kit import own
-from servobench.harness.run.identification import fit_cameras
+from servobench.harness.apps.twin.identification import fit_cameras
 from servobench.plant.cameras.optics import Optics, in_image, locate, project, project_rates
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SetupModel

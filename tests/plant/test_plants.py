@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kit.plants import ALL_PLANTS, nominal_ur5
-from servobench.harness.check.plants import check_plant
+from servobench.harness.apps.check.plants import check_plant
 from servobench.harness.config.registry import RENDERED, find_plant
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.contract.settings import override

@@ -1,0 +1,154 @@
+"""Exports a controller as a co-simulation FMU: a recorded step, its variables, its reference run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from servobench.fmus.controllers.branches import NOT_DEFINITE
+from servobench.fmus.controllers.record import Recorded
+from servobench.fmus.model_description import Description, sampled_sections
+from servobench.fmus.product import Product, c_files, documentation, word
+from servobench.fmus.reference import tables
+from servobench.fmus.sources import generated_source
+from servobench.fmus.variables import INPUT, SAMPLED, Group, Layout
+from servobench.plant.contract.checks import FloatArray
+
+MODEL: Final = "controller"
+CORE: Final = "controller"
+# Names of the variables.
+POSITION: Final = "joint_position"
+FEATURE: Final = "feature"
+SEEN: Final = "seen"
+REFERENCE: Final = "reference"
+COMMAND: Final = "joint_velocity_command"
+JACOBIAN: Final = "jacobian"
+
+
+def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]:
+    """Return the variables of a controller.
+
+    Args:
+        n: joints.
+        m: features.
+        rows: of the reference.
+        unit: of a feature.
+    """
+    return (
+        Group(POSITION, (n,), INPUT, "rad", "Joint position as the encoders report it."),
+        Group(
+            FEATURE,
+            (m,),
+            INPUT,
+            unit,
+            "Measured feature; where it is missing, the last valid value.",
+        ),
+        Group(SEEN, (m,), INPUT, "1", "1 where the feature was measured for this instant, else 0."),
+        Group(
+            REFERENCE,
+            (rows, m),
+            INPUT,
+            unit,
+            "Desired feature now, in row 1, and at the next instants.",
+        ),
+        Group(
+            COMMAND,
+            (n,),
+            SAMPLED,
+            "rad/s",
+            "Joint velocity for the period that begins at this instant.",
+        ),
+        Group(
+            JACOBIAN,
+            (m, n),
+            SAMPLED,
+            f"{unit}/rad",
+            "Estimated Jacobian, 0 before there is one; for evaluation.",
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class ControllerModel:
+    """A controller ready for export."""
+
+    name: str  # by which it is known
+    summary: str  # one line
+    recorded: Recorded  # its step, of the columns [time, inputs]
+    groups: tuple[Group, ...]  # from `controller_groups`
+    period: float  # s
+    # A run of the original: time, inputs and the outputs for them by name, (k, size).
+    run: Mapping[str, FloatArray]
+    settings: str  # settings of the original, for the documentation
+
+    @property
+    def identifier(self) -> str:
+        """Name of the libraries."""
+        return word(self.name, "controller")
+
+    @cached_property
+    def source(self) -> str:
+        """The generated C file."""
+        return generated_source(CORE, (self.recorded.start, self.recorded.step))
+
+    def product(self, fmi_version: int, start: Mapping[str, FloatArray] | None = None) -> Product:
+        """Return the content of the FMU.
+
+        Args:
+            fmi_version: 2 or 3.
+            start: values of inputs by name, (size,), at the start; zeros for others, and ones for `seen`.
+        """
+        layout = Layout(self.groups)
+        starts = {SEEN: np.ones_like(self.run[SEEN][0]), **(start or {})}
+        return Product(
+            fmi_version=fmi_version,
+            folder=MODEL,
+            core=CORE,
+            source=self.source,
+            constants=self._constants(layout),
+            description=Description(
+                model_name=f"Controller {self.name}",
+                model_identifier=self.identifier,
+                summary=f"{self.name}: {self.summary}.",
+                layout=layout,
+                sections=sampled_sections(layout),
+                start=starts,
+                sources=c_files(fmi_version, CORE),
+                step=self.period,
+                exchange=False,
+            ),
+            documentation=documentation(
+                MODEL,
+                layout,
+                name=self.name,
+                summary=self.summary,
+                period=f"{self.period:g}",
+                memory=str(self.recorded.states),
+                settings=self.settings,
+            ),
+            reference=self._reference(layout),
+        )
+
+    def _constants(self, layout: Layout) -> dict[str, float]:
+        """Return the sizes of arrays and work space, and the codes, that the C model needs."""
+        parts = (self.recorded.start, self.recorded.step)
+        pointers = [size for part in parts for size in (part.sz_arg(), part.sz_res())]
+        return {
+            "PERIOD": self.period,
+            "N_MEMORY": max(self.recorded.states, 1),
+            "N_FEATURES": layout.by_name[SEEN].size,
+            "N_ANSWERS": sum(group.size for group in layout.of_role(SAMPLED)),
+            "N_POINTERS": max(pointers),
+            "N_WORK": max(1, *(part.sz_w() for part in parts)),
+            "N_WHOLE_WORK": max(1, *(part.sz_iw() for part in parts)),
+            "FAULT_NOT_DEFINITE": NOT_DEFINITE,
+        }
+
+    def _reference(self, layout: Layout) -> tuple[str, str]:
+        """Return the run as CSV; the outputs at an instant, before its inputs, are those of the last one."""
+        before = {}
+        for name in (COMMAND, JACOBIAN):
+            before[name] = np.pad(self.run[name][:-1], ((1, 0), (0, 0)))
+        return tables({**self.run, **before}, layout)

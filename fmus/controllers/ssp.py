@@ -1,0 +1,95 @@
+"""Writes a plant, a controller and their connections as one file of SSP 1.0 (System Structure and Parameterization)."""
+
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from servobench.fmus.compiler import Platform
+from servobench.fmus.controllers.export import COMMAND, FEATURE, POSITION, SEEN
+from servobench.fmus.model_description import UNITS, exporter, xml_bytes
+from servobench.fmus.product import Product, write_archive
+from servobench.fmus.variables import BALL, INPUT
+
+SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
+SSC: Final = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+STRUCTURE: Final = "SystemStructure.ssd"
+PLANT = "plant"
+CONTROLLER = "controller"
+
+
+def write_loop(
+    path: Path, plant: Product, controller: Product, platforms: tuple[Platform, ...], stop: float
+) -> Path:
+    """Write the closed loop of two products of FMI 2.
+
+    Args:
+        path: the .ssp file; its folder must exist.
+        plant: an arm.
+        controller: of that arm.
+        platforms: to compile for.
+        stop: of the default experiment [s].
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: an FMU cannot be compiled, or the folder takes no file.
+    """
+    products = {PLANT: plant, CONTROLLER: controller}
+    contents = {STRUCTURE: structure(products, stop)}
+    with tempfile.TemporaryDirectory(prefix="servobench-ssp-") as folder:
+        for name, product in products.items():
+            fmu = product.write(Path(folder) / f"{name}.fmu", platforms)
+            contents[f"resources/{name}.fmu"] = fmu.read_bytes()
+    write_archive(path, contents, STRUCTURE)
+    return path
+
+
+def structure(products: Mapping[str, Product], stop: float) -> bytes:
+    """Return the description of the system: components with the connectors in use, and the connections."""
+    ET.register_namespace("ssd", SSD)
+    ET.register_namespace("ssc", SSC)
+    attributes = {"name": "loop", "version": "1.0", "generationTool": exporter()}
+    root = ET.Element(f"{{{SSD}}}SystemStructureDescription", attributes)
+    groups = {name: product.description.layout.by_name for name, product in products.items()}
+    feature = BALL if BALL in groups[PLANT] else FEATURE
+    measured = (("encoder_position", POSITION), (feature, FEATURE), (SEEN, SEEN))
+    wires = [((PLANT, own), (CONTROLLER, wanted)) for own, wanted in measured]
+    wires.append(((CONTROLLER, COMMAND), (PLANT, COMMAND)))
+    ends = [(side, groups[side][name]) for start, end in wires for side, name in (start, end)]
+    system = ET.SubElement(root, f"{{{SSD}}}System", name="loop")
+    elements = ET.SubElement(system, f"{{{SSD}}}Elements")
+    for side in products:
+        source = {"source": f"resources/{side}.fmu", "type": "application/x-fmu-sharedlibrary"}
+        component = ET.SubElement(elements, f"{{{SSD}}}Component", {"name": side, **source})
+        connectors = ET.SubElement(component, f"{{{SSD}}}Connectors")
+        for group in dict.fromkeys(group for own, group in ends if own == side):
+            for scalar in group.scalar_names():
+                kind = "input" if group.role == INPUT else "output"
+                connector = ET.SubElement(connectors, f"{{{SSD}}}Connector", name=scalar, kind=kind)
+                ET.SubElement(connector, f"{{{SSC}}}Real", unit=group.unit)
+    connections = ET.SubElement(system, f"{{{SSD}}}Connections")
+    for (start, first), (end, second) in wires:
+        pairs = zip(
+            groups[start][first].scalar_names(), groups[end][second].scalar_names(), strict=True
+        )
+        for one, other in pairs:
+            names = {
+                "startElement": start,
+                "startConnector": one,
+                "endElement": end,
+                "endConnector": other,
+            }
+            ET.SubElement(connections, f"{{{SSD}}}Connection", names)
+    _units(root, {group.unit for _, group in ends})
+    ET.SubElement(root, f"{{{SSD}}}DefaultExperiment", startTime="0", stopTime=repr(stop))
+    return xml_bytes(root)
+
+
+def _units(root: ET.Element, used: set[str]) -> None:
+    units = ET.SubElement(root, f"{{{SSD}}}Units")
+    for name in sorted(used):
+        unit = ET.SubElement(units, f"{{{SSC}}}Unit", name=name)
+        ET.SubElement(unit, f"{{{SSC}}}BaseUnit", UNITS.get(name, {}))

@@ -1,0 +1,271 @@
+"""Controllers and closed loops made ready for export as FMUs.
+
+The step of a controller is recorded, and a run of it is kept inside the FMU for comparison.
+"""
+
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+
+from servobench.controllers.controller import ControllerEntry
+from servobench.controllers.servo import Servo, ServoController, ServoState
+from servobench.fmus.controllers.arrays import NotTraceable
+from servobench.fmus.controllers.branches import leaves_of
+from servobench.fmus.controllers.export import (
+    COMMAND,
+    FEATURE,
+    JACOBIAN,
+    POSITION,
+    REFERENCE,
+    SEEN,
+    ControllerModel,
+    controller_groups,
+)
+from servobench.fmus.controllers.record import Recorded, record
+from servobench.fmus.export import ExportOptions, nominal_setup, product
+from servobench.fmus.product import Product
+from servobench.fmus.variables import INPUT
+from servobench.harness.config.registry import find_controller
+from servobench.harness.config.settings import Settings, flatten
+from servobench.harness.run.experiment import Experiment, build, draw, draw_robot
+from servobench.harness.run.loop import LoopSettings, begin, periods
+from servobench.harness.run.request import RunRequest, find_robot
+from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections, select
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.signals import Observation, trusted_observation
+from servobench.plant.kinematic import KinematicConfig
+
+REFERENCE_PERIODS: Final = 200  # most periods of the run inside the FMU
+TOLERANCE: Final = 1e-9
+STRETCH: Final = 5  # periods, compared on their own where learning magnifies rounding errors
+USUAL: Final = KinematicConfig()  # lag and limits of an exported arm
+
+
+def controller_model(request: RunRequest, settings: Settings) -> ControllerModel:
+    """Return a controller ready for export, for the robot and the sensing of a request.
+
+    Args:
+        request: of the run inside the FMU.
+        settings: overrides of the defaults.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
+    """
+    entry = find_controller(request.controller)
+    if entry.needs_truth:
+        raise ConfigurationError(
+            f"controller {entry.name!r} cannot be exported: it is given the true robot"
+        )
+    resolved = resolve(request, settings)
+    experiment = build(resolved)
+    with closing(experiment.plant):
+        return _model(entry, resolved, experiment)
+
+
+def _model(
+    entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
+) -> ControllerModel:
+    controller = experiment.controller
+    spec = experiment.plant.spec
+    name = f"controller {entry.name!r}"
+    if not isinstance(controller, ServoController):
+        raise ConfigurationError(
+            f"{name} cannot be exported: it is not composed of an estimator and a law"
+        )
+    if not controller.servo.initial.immediate:
+        remedy = "set initial.source to nominal or given"
+        raise ConfigurationError(
+            f"{name} cannot be exported while it probes its initial Jacobian: {remedy}"
+        )
+    groups = controller_groups(spec.n, spec.m, 1 + experiment.run.preview_rows, spec.feature_unit)
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
+    shapes |= {
+        each.name: (each.shape, "b" if each.name == SEEN else "f")
+        for each in groups
+        if each.role == INPUT
+    }
+    columns, states = _run(experiment)
+    inputs = np.column_stack([columns[each] for each in shapes])
+    outputs = np.column_stack([columns[COMMAND], columns[JACOBIAN]])
+    try:
+        recorded = record(
+            controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes
+        )
+        kept = _repeated_periods(recorded, inputs, outputs, states)
+    except NotTraceable as error:
+        sensing = resolved.request.sensing
+        where = "" if sensing == DEFAULT_SENSING else f" with the sensing {sensing}"
+        raise ConfigurationError(f"{name} has no exported form{where}: {error}") from error
+    return ControllerModel(
+        name=entry.name,
+        summary=entry.summary,
+        recorded=recorded,
+        groups=groups,
+        period=spec.period,
+        run={each: rows[:kept] for each, rows in columns.items()},
+        settings="\n".join(
+            f"{key} = {value}" for key, value in flatten(resolved.controller).items()
+        ),
+    )
+
+
+def _repeated_periods(
+    recorded: Recorded, inputs: FloatArray, outputs: FloatArray, states: list[FloatArray]
+) -> int:
+    """Return for how many periods the recorded step repeats a run.
+
+    Learning may magnify rounding errors without bound. Then short stretches are compared, each from the state of the
+    original, and the periods end before these errors count.
+
+    Raises:
+        NotTraceable: it differs.
+    """
+    states = [recorded.start(inputs[0])[0], *states]
+
+    def differences(stretch: int) -> FloatArray:
+        """Return that of each period, (k,), as `fmu validate` counts it; a stretch begins at the original's state."""
+        repeated = np.empty_like(outputs)
+        state = states[0]
+        for k, row in enumerate(inputs):
+            if k % stretch == 0:
+                state = states[k // STRETCH]
+            state, output, _ = recorded.step(state, row)
+            repeated[k] = np.asarray(output).reshape(-1)
+        sizes = np.maximum(1.0, np.abs(outputs))
+        return np.asarray((np.abs(repeated - outputs) / sizes).max(axis=1))
+
+    whole = differences(len(inputs))
+    if whole.max() <= TOLERANCE:
+        return len(whole)
+    # Rounding errors take longer to grow than the first stretch.
+    for largest, most in (
+        (whole[:STRETCH].max(), 0.1 * TOLERANCE),
+        (differences(STRETCH).max(), TOLERANCE),
+    ):
+        if not largest <= most:
+            allowed = f"allowed is {most:.0g}: take another method, sensing or robot"
+            raise NotTraceable(
+                f"over {STRETCH} periods it would differ from the original by {largest:.1g}, {allowed}"
+            )
+    return int(np.argmin(whole <= 0.1 * TOLERANCE))
+
+
+def _observation(inputs: Mapping[str, Any]) -> Observation:
+    valid = inputs[SEEN]
+    both = inputs[POSITION], inputs[FEATURE]
+    return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
+
+
+def _step(
+    servo: Servo, state: ServoState, inputs: Mapping[str, Any]
+) -> tuple[ServoState, FloatArray]:
+    """Return the new state, and command and Jacobian in one row."""
+    state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
+    jacobian = servo.jacobian(state)
+    known = np.where(np.isnan(jacobian), 0.0, jacobian)
+    return state, np.concatenate([velocity, known.reshape(-1)])
+
+
+def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray]]:
+    """Carry out the run that the FMU repeats for comparison, with seed 0; it may end early.
+
+    No camera is moved, and lost features do not end it.
+
+    Returns:
+        Time, inputs and outputs by name, (k, size), and the numbers of the state after every `STRETCH` periods.
+    """
+    controller = experiment.controller
+    spec = experiment.plant.spec
+    length = LoopSettings(experiment.periods, experiment.run.preview_rows)
+    rollout = begin(experiment.plant, controller, experiment.desired(), length, (0, 0))
+    unknown = np.zeros((spec.m, spec.n))
+    rows = []
+    states = []
+    try:
+        for period in islice(periods(rollout, controller), REFERENCE_PERIODS):
+            observation = period.observation
+            estimate = controller.estimated_jacobian()
+            row = (
+                observation.time,
+                observation.joint_position,
+                observation.feature,
+                observation.valid,
+                np.ravel(period.reference),
+                period.command.joint_velocity,
+                np.ravel(unknown if estimate is None else estimate),
+            )
+            rows.append(row)
+            if len(rows) % STRETCH == 0:
+                states.append(np.hstack([*map(np.ravel, leaves_of(controller.save()))]))
+    except RunFault as fault:
+        if not rows:
+            raise ConfigurationError(
+                f"the run that is kept inside the FMU failed at once: {fault}"
+            ) from fault
+    columns = (np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
+    names = ("time", POSITION, FEATURE, SEEN, REFERENCE, COMMAND, JACOBIAN)
+    return dict(zip(names, columns, strict=True)), states
+
+
+def arm_product(
+    request: RunRequest,
+    words: str,
+    fmi: int = 2,
+    own: PlantSetup | None = None,
+    config: KinematicConfig = USUAL,
+) -> Product:
+    """Return the true arm of a run ready for export, with `words` on its mismatch.
+
+    Its start and period are those of a setup of its `own`, or home and the usual step; lag, limits and mechanics those
+    of the kinematic plant.
+
+    Raises:
+        ConfigurationError: a robot, sensing or mismatch that cannot be used.
+    """
+    unknown = list(request.mismatch.plant_settings)
+    if request.mismatch.size("camera_move") > 0.0:
+        unknown.append("camera_move")
+    for setting in unknown:
+        part, _, name = setting.rpartition(".")
+        remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
+        raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
+    true, *_ = draw_robot(request)
+    setup = replace(own or nominal_setup(find_robot(request.robot)), model=true)
+    return product(ExportOptions(fmi, setup, config, mismatch=words))
+
+
+def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
+    """Return plant and controller of a run whose target rests, and how long the run is [s].
+
+    The plant begins where the run does; the reference of the controller starts as the target of the run.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used, a setting of the plant that the arm does not have, or
+            a controller that has no exported form.
+    """
+    sections = resolve_sections([request], settings)
+    resolved = select(request, sections)
+    for key in sorted(sections.given.get(request.plant, ())):
+        if key.partition(".")[0] not in ("lag", "max_joint_speed", "joint_range", "mechanics"):
+            has = "lag, limits and mechanics, and is seen without noise and latency and commanded a period later"
+            raise ConfigurationError(
+                f"the arm of an SSP has {has}: leave {request.plant}.{key} out"
+            )
+    scenario = draw(resolved).scenario
+    run = resolved.run
+    config = resolved.plant
+    reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
+    arm = KinematicConfig(
+        config.max_joint_speed, config.joint_range, config.lag, mechanics=config.mechanics
+    )
+    setup = PlantSetup(None, scenario.start, run.period, find_robot(request.robot))
+    plant = arm_product(request, f"{request.mismatch}, seed {request.seed}", 2, setup, arm)
+    controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
+    return plant, controller, scenario.duration

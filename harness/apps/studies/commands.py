@@ -1,0 +1,165 @@
+"""The commands `servobench robustness | suite | claims`: studies that compare methods."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import PLANT, Value, option
+from servobench.harness.cli.results import judge
+from servobench.harness.cli.selection import Names
+from servobench.harness.cli.terminal import FAILED, console, print_tables, say
+from servobench.plant.contract.files import split_words
+
+DEFAULT_CONTROLLERS = (
+    "regression_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
+)
+
+
+def _challenges() -> Names:
+    from servobench.harness.apps.studies.challenge import challenge_names, find_challenge
+
+    return Names(challenge_names, find_challenge)
+
+
+CHALLENGE = Value("NAME", selection.completing(_challenges))
+
+
+def robustness(
+    *,
+    out: options.FolderOption,
+    plant: Annotated[str, option(PLANT, "Name or file of the plant.")] = "fmu",
+    controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
+    seeds: options.SeedsOption = "40",
+    robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
+    axes: Annotated[
+        str,
+        option(
+            "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."
+        ),
+    ] = "",
+    running: options.Running,
+    overrides: options.Overrides,
+) -> None:
+    """Draw success and settling time along seven axes.
+
+    The robustness map; each axis of the mismatch or of the sensor is varied by itself.
+    """
+    from servobench.harness.apps.studies.robustness import BASE, TASK, find_lines, make_map
+    from servobench.harness.batch.plan import Batch, parse_seeds
+    from servobench.harness.cli.progress import watching
+    from servobench.harness.run.request import find_robot
+
+    settings = overrides.settings()
+    lines = find_lines(split_words(axes))
+    names = selection.split("controllers", controllers, robot=robot)
+    where = selection.split("plants", plant, option="plant", robot=robot)[0]
+    base = "none" if find_robot(robot).twin else BASE
+    batch = Batch((where,), names, (TASK,), (base,), parse_seeds(seeds), robot, (sensing,))
+    with watching(console, out, running.execution()) as how:
+        files = make_map(out, batch, settings, how, lines)
+    say(f"the map is in {files[0]}; its runs are in {out}")
+    judge(out, strict=False)
+
+
+def suite(
+    *,
+    out: options.FolderOption,
+    challenges: Annotated[
+        str,
+        option(
+            CHALLENGE.several(),
+            "Comma-separated names, or .toml files of your own; default: all names.",
+        ),
+    ] = selection.ALL,
+    grade: Annotated[
+        str,
+        option("NAMES", "Comma-separated grades, I, II or III, of the challenges; default: all."),
+    ] = "",
+    controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
+    plants: Annotated[
+        str, option(PLANT.several(), "Comma-separated names or files; default: those of each file.")
+    ] = "",
+    seeds: options.SeedsOption = "40",
+    reference_seeds: Annotated[
+        int | None,
+        option(
+            "COUNT", "Robots on which references run and scores are given; default: all.", min=1
+        ),
+    ] = None,
+    running: options.Running,
+    overrides: options.Overrides,
+) -> None:
+    """Score methods over challenges, worlds that tell them apart.
+
+    A score is the error or time of a method that knows the true robot over that of the method; a lost run has 0.
+    """
+    from servobench.harness.apps.studies.challenge import choose_challenges
+    from servobench.harness.apps.studies.suite import carry_out_suite, suite_tables
+    from servobench.harness.batch.plan import parse_seeds
+    from servobench.harness.cli.progress import watching
+
+    worlds = choose_challenges(
+        selection.split(_challenges, challenges, option="challenges"), split_words(grade)
+    )
+    names = selection.split("controllers", controllers)
+    where = selection.split("plants", plants) if plants else ()
+    robots = parse_seeds(seeds)
+    runs = {world.name: world.cells(where, names, robots, reference_seeds) for world in worlds}
+    with watching(console, out, running.execution()) as how:
+        judged = carry_out_suite(out, worlds, runs, overrides.settings(), how)
+    print_tables(suite_tables(judged), "score: reference over method, at most 1; 0 for a lost run")
+    say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")
+
+
+def claims(
+    *,
+    out: options.FolderOption,
+    plants: options.PlantsOption = "kinematic,fmu",
+    seeds: Annotated[
+        int, option("COUNT", "Robots for each move; two fifths of them for the circle.")
+    ] = 500,
+    division: Annotated[
+        Literal["equipped", "published", "both"],
+        option(
+            "NAME",
+            "Form of the methods: equipped (all aids), published (the law as printed) or both.",
+        ),
+    ] = "both",
+    mismatch: options.MismatchOption = "moderate",
+    running: options.Running,
+    check: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "Table of answers that must come out the same; the exit code is 1 if they differ.",
+        ),
+    ] = None,
+) -> None:
+    """Answer the paper's seven claims with statistics.
+
+    The figure behind each answer is drawn as well.
+    """
+    from servobench.harness.apps.studies import reproduction
+    from servobench.harness.apps.studies.claims import DIVISIONS
+    from servobench.harness.cli.progress import watching
+
+    names = selection.split("plants", plants)
+    divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
+    wanted = None if check is None else reproduction.read_answers(check)
+    with watching(console, out, running.execution()) as how:
+        answers = reproduction.reproduce(out, names, seeds, how, divisions, mismatch)
+    for answer in answers:
+        title = f"{answer.title} on {answer.plant}, {answer.division}"
+        verdict = answer.verdict + reproduction.elsewhere(answer, answers)
+        console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
+        console.print(answer.evidence, markup=False, highlight=False)
+    say(f"answers in {out / reproduction.ANSWERS}, figures in {out / reproduction.FIGURES}")
+    if wanted is not None:
+        lines = reproduction.differences(answers, wanted)
+        say("\n".join(lines) or f"the same answers as in {check}")
+        if lines:
+            sys.exit(FAILED)

@@ -1,0 +1,414 @@
+"""All studies of all methods, advanced in step; the best of each method, chosen on other robots; and its check.
+
+In each round every study asks for the one point that it needs next; all runs of the points that no ledger knows yet are
+carried out by the workers, and the ledgers of their methods take the costs. Every decision is made in this process from
+the ledgers alone: so the outcome is the same for any number of workers, and for a call that was interrupted and
+repeated.
+
+The check of tuned values: on the second set of robots no change of one value may improve the score by much. The changes
+are those of the coordinate search: each other value of each switch, and 20 % more and less of each number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, final
+
+from servobench.harness.apps.tuning.objective import (
+    LEDGER,
+    SECOND,
+    WORST,
+    Ledger,
+    Trial,
+    TuningSet,
+    Wanted,
+    fill,
+    open_ledger,
+    score,
+)
+from servobench.harness.apps.tuning.spaces import (
+    Point,
+    StudyRecord,
+    default_values,
+    edges,
+    find_space,
+    find_tunable,
+    first_points,
+    neighbours,
+    nested_settings,
+    study,
+    tuned_point,
+    values_of,
+)
+from servobench.harness.batch.isolation import Workers
+from servobench.harness.batch.lock import LOCK
+from servobench.harness.config.description import toml
+from servobench.harness.config.settings import default_config, file_stem, flatten
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.settings import Count, Periods, settings
+
+HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
+TOLERANCE: Final = 0.03  # [1] share of the score by which no change may improve it
+
+
+@settings
+class TuningPlan:
+    """The settings of a tuning campaign."""
+
+    controllers: tuple[str, ...]
+    """names with a search space"""
+    trials: Count
+    """of the sampler in each study, that of the defaults and of other known settings included"""
+    runs: TuningSet
+    """on which a point is scored"""
+    studies: Count = 3
+    """of each method, with samplers of their own"""
+    search: Periods = 100
+    """most points of the coordinate search that ends a study"""
+    study_seed: Periods = 0
+    """seed of the first study's sampler; the others count on from it"""
+
+
+@final
+class RunningStudy:
+    """A study and where it stands.
+
+    Attributes:
+        wanted: the nested settings that it asks for; None once it has ended.
+        asked: number of points that it was given the scores of.
+        outcome: its result, once it has ended.
+    """
+
+    def __init__(self, course: Generator[Point, float, StudyRecord]) -> None:
+        """Ask for the first point."""
+        self.asked = 0
+        self.outcome: StudyRecord | None = None
+        self._course = course
+        self.wanted: Mapping[str, Any] | None = nested_settings(next(course))
+
+    def advance(self, ledger: Ledger) -> None:
+        """Go on up to a point that the ledger does not know, or to the end."""
+        while self.wanted is not None and (costs := ledger.costs(self.wanted)) is not None:
+            try:
+                self.asked += 1
+                self.wanted = nested_settings(self._course.send(score(costs)))
+            except StopIteration as end:
+                self.wanted = None
+                self.outcome = end.value
+
+
+@final
+class Method:
+    """A controller with its studies and the ledgers of both sets."""
+
+    def __init__(self, folder: Path, name: str, plan: TuningPlan) -> None:
+        """Open its ledgers and begin its studies.
+
+        Raises:
+            ConfigurationError: a file of the folder is no ledger, or one of other settings or runs.
+        """
+        self.name = name
+        self._plan = plan
+        self.ledger = open_ledger(folder, name, plan.runs)
+        self.second = open_ledger(folder, name, plan.runs.second(), SECOND)
+        entry = find_tunable(name)
+        self._default = nested_settings(default_values(entry))
+        self._known = [self._default, nested_settings(tuned_point(entry))]
+        space = find_space(name)
+        first = first_points(name)
+        self.studies = []
+        for seed in range(plan.study_seed, plan.study_seed + plan.studies):
+            course = study(name, space, first, plan.trials, plan.search, seed)
+            self.studies.append(RunningStudy(course))
+
+    @property
+    def done(self) -> int:
+        """Number of requested points, as if every finished study had used its whole budget."""
+        whole = self._plan.trials + self._plan.search
+        return sum(each.asked if each.outcome is None else whole for each in self.studies)
+
+    def wanted(self) -> list[Wanted]:
+        """Return the points that its studies ask for, after they went on as far as the ledger knows."""
+        wanted: list[Wanted] = []
+        for each in self.studies:
+            each.advance(self.ledger)
+            if each.wanted is not None:
+                wanted.append((self.ledger, self.name, each.wanted))
+        return wanted
+
+    def wanted_on_second(self) -> list[Wanted]:
+        """Return the points to score on the second set, once all studies have ended: their results and known values."""
+        outcomes = self._outcomes()
+        if len(outcomes) < len(self.studies):
+            return []
+        points = [*self._scored(), *(each.settings for each in outcomes)]
+        return [(self.second, self.name, point) for point in points]
+
+    def _outcomes(self) -> list[StudyRecord]:
+        """Return the results of the studies that have ended."""
+        return [each.outcome for each in self.studies if each.outcome is not None]
+
+    def _scored(self) -> list[Mapping[str, Any]]:
+        """Return the defaults and the values in use, as far as they were scored: a study may have a single trial."""
+        return [each for each in self._known if self.ledger.costs(each) is not None]
+
+    def result(self) -> TunedValues | None:
+        """Return the tuned values; None while a study is not finished or not scored on the second set.
+
+        They are the best ones on the second set: of a study, the defaults, or the values in use so far.
+        """
+        outcomes = self._outcomes()
+        if len(outcomes) < len(self.studies):
+            return None
+        candidates = [*(each.settings for each in outcomes), *self._scored()]
+        second_costs = [each for each in map(self.second.costs, candidates) if each is not None]
+        if len(second_costs) < len(candidates):
+            return None
+        second_scores = [score(each) for each in second_costs]
+        best = candidates[second_scores.index(min(second_scores))]
+        own = self.ledger.costs(best)
+        of_defaults = self.ledger.costs(self._default)
+        second_of_defaults = self.second.costs(self._default)
+        if own is None or of_defaults is None or second_of_defaults is None:
+            return None
+        runs = self._plan.runs
+        checked = runs.checked()
+        records = [
+            replace(each, second_score=second)
+            for each, second in zip(outcomes, second_scores, strict=False)
+        ]
+        return TunedValues(
+            controller=self.name,
+            **asdict(runs),
+            runs_a_trial=len(own),
+            runs_of_second_set=len(second_of_defaults),
+            date=datetime.now(UTC).date().isoformat(),
+            version=version("servobench"),
+            score=score(own),
+            score_of_defaults=score(of_defaults),
+            second_score=min(second_scores),
+            second_score_of_defaults=score(second_of_defaults),
+            checked_score=score([own[i] for i in checked]),
+            checked_score_of_defaults=score([of_defaults[i] for i in checked]),
+            settings=best,
+            studies=tuple(records),
+            edges=edge_lines(self.name, best),
+        )
+
+
+def check_study_folder(folder: Path) -> None:
+    """Refuse a folder with other things than studies in it.
+
+    Raises:
+        ConfigurationError: names the folder.
+    """
+    names = []
+    if folder.is_dir():
+        names = [path.name for path in folder.iterdir()]
+    elif folder.exists():
+        names = [folder.name]
+    if set(names) - {LOCK} and not any(name.endswith(LEDGER) for name in names):
+        raise ConfigurationError(
+            f"{folder} exists already and holds no study; name another folder with --out"
+        )
+
+
+def open_methods(folder: Path, plan: TuningPlan) -> list[Method]:
+    """Open the ledgers of a plan's methods and begin their studies.
+
+    Raises:
+        ConfigurationError: a ledger of the folder is another one, or a method cannot be built.
+    """
+    methods = [Method(folder, name, plan) for name in plan.controllers]
+    for method in methods:  # an error that no setting can cure is reported before any run
+        config = default_config(find_tunable(method.name))
+        Trial(method.name, config).build(plan.runs.runs())
+    return methods
+
+
+def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> Iterator[Method]:
+    """Carry the studies out, and score those of a method on the second set as soon as all of them have ended.
+
+    Yields:
+        A method after each of its points.
+    """
+    by_name = {method.name: method for method in methods}
+    under_way = True
+    while under_way:
+        wanted = [point for method in methods for point in method.wanted()]
+        under_way = bool(wanted)
+        yield from methods
+        chosen = [point for method in methods for point in method.wanted_on_second()]
+        for name in fill(wanted, plan.runs, workers):
+            yield by_name[name]
+        for name in fill(chosen, plan.runs.second(), workers):
+            yield by_name[name]
+
+
+def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, TunedValues]:
+    """Return the results of every method whose studies are finished by its name, and write them, `NAME.toml`.
+
+    Results without a run that ended well are of no use and not written.
+    """
+    results = {}
+    for method in methods:
+        tuned = method.result()
+        if tuned is not None:
+            results[method.name] = tuned
+    for name, tuned in results.items():
+        if not tuned.lost:
+            write_tuned(folder / f"{file_stem(name)}.toml", tuned)
+    return results
+
+
+@dataclass(frozen=True)
+class TunedValues:
+    """The results of all studies of a method, and the values that were best on the second set."""
+
+    controller: str
+    plants: tuple[str, ...]  # plants on which the runs took place
+    robots: int  # robots under each condition (`--robots`)
+    offset: int  # where in the tuning range the seeds begin (`--offset`)
+    runs_a_trial: int
+    runs_of_second_set: int
+    date: str  # day on which the file was written, UTC
+    version: str  # servobench's version
+    score: float  # score of these values
+    score_of_defaults: float  # score of the defaults of the controller's class
+    second_score: float  # score of these values on the second set of robots
+    second_score_of_defaults: float
+    checked_score: float  # score of these values on the subset `TuningSet.checked`
+    checked_score_of_defaults: float
+    settings: Mapping[str, Any]  # nested values
+    # Empty for values that were found under another objective and only scored anew.
+    studies: tuple[StudyRecord, ...]
+    # A line for each number at an edge of its box, which is wider in the next study
+    edges: tuple[str, ...] = ()
+
+    @property
+    def lost(self) -> bool:
+        """Whether every run has the worst cost, also with the best values."""
+        return math.isclose(self.second_score, WORST)
+
+
+def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
+    values = flatten(nested)
+    boxes: dict[str, Any] = dict(find_space(name))
+    lines = []
+    for key, end in edges(boxes, values).items():
+        box = f"{boxes[key].low:g} to {boxes[key].high:g}"
+        lines.append(f"{key} = {values[key]:.4g} is at the {end} edge of {box}")
+    return tuple(lines)
+
+
+def write_tuned(path: Path, tuned: TunedValues) -> None:
+    """Write the file atomically."""
+    values = asdict(tuned)
+    records = values.pop("studies")
+    if not records:
+        values["studies"] = ()
+    text = HEADING + _table(values)
+    for record in records:
+        text += _table(record, "studies.", "\n[[studies]]\n")
+    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+
+
+def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
+    """Return a table in TOML, those in it after its own values; `before` stands before their names."""
+    lines = ""
+    tables = ""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            name = f"{before}{key}"
+            tables += _table(value, f"{name}.", f"\n[{name}]\n")
+        else:
+            lines += f"{key} = {toml(value)}\n"
+    if tables and not lines:  # TOML needs no heading of a table that only holds tables
+        return tables
+    return heading + lines + tables
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of one value of a method's settings in use, and its effect on the score."""
+
+    controller: str
+    key: str
+    before: Any
+    after: Any
+    score_before: float
+    score_after: float
+
+    @property
+    def gain(self) -> float:
+        """Share of the score that the change gains; negative if it loses."""
+        return 1.0 - self.score_after / self.score_before
+
+
+class Check:
+    """The settings in use of some methods with all their changes, on one set of runs."""
+
+    def __init__(self, folder: Path, controllers: Sequence[str], runs: TuningSet) -> None:
+        """Open the ledgers, in which a check goes on where it stopped.
+
+        Args:
+            folder: of the ledgers.
+            controllers: names of methods with a search space.
+            runs: the runs on which changes are judged.
+
+        Raises:
+            ConfigurationError: a name or a file that cannot be used.
+        """
+        self._runs = runs
+        self._changes: list[tuple[Ledger, list[dict[str, Any]], partial[Change]]] = []
+        points: dict[str, Wanted] = {}
+        for name in controllers:
+            config = default_config(find_tunable(name))
+            Trial(name, config).build(runs.runs())
+            ledger = open_ledger(folder, name, runs, SECOND)
+            values = values_of(name, config)
+            before = nested_settings(values)
+            for key, other in neighbours(find_space(name), values):
+                after = nested_settings(other)
+                if before != after:
+                    change = partial(Change, name, key, values[key], other[key])
+                    self._changes.append((ledger, [before, after], change))
+                    points[f"{name}{before}"] = (ledger, name, before)
+                    points[f"{name}{after}"] = (ledger, name, after)
+        self._points = list(points.values())
+
+    def __len__(self) -> int:
+        """Return the number of points to score, those known already included."""
+        return len(self._points)
+
+    def known(self) -> int:
+        """Return how many of the points the ledgers know."""
+        return sum(ledger.costs(point) is not None for ledger, _, point in self._points)
+
+    def carry_out(self, workers: Workers) -> Iterator[str]:
+        """Score the points that the ledgers lack, and yield the controller of each point."""
+        yield from fill(self._points, self._runs, workers)
+
+    def changes(self) -> list[Change]:
+        """Return every change whose scores are known."""
+        known = []
+        for ledger, (before, after), change in self._changes:
+            costs_before = ledger.costs(before)
+            costs_after = ledger.costs(after)
+            if costs_before and costs_after:
+                known.append(change(score(costs_before), score(costs_after)))
+        return known
+
+
+def improvements(changes: Sequence[Change]) -> list[Change]:
+    """Return the changes that gain more than the tolerance, the largest first."""
+    found = [change for change in changes if change.gain > TOLERANCE]
+    return sorted(found, key=lambda change: -change.gain)

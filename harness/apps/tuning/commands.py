@@ -1,0 +1,197 @@
+"""The command `servobench tune`: a search for the best settings of each method."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import CONTROLLER, option, switch
+from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, say
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from servobench.harness.apps.tuning.campaign import Method, TunedValues, TuningPlan
+    from servobench.harness.apps.tuning.objective import TuningSet
+    from servobench.harness.batch.isolation import Workers
+
+
+def tune(
+    *,
+    controllers: Annotated[
+        str, option(CONTROLLER.several(), "Comma-separated names, or all that have a search space.")
+    ] = "all",
+    studies: Annotated[
+        int,
+        option(
+            "COUNT",
+            "Studies of each method; their results and the values in use meet on a second set of robots.",
+        ),
+    ] = 3,
+    trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
+    search: Annotated[
+        int,
+        option("COUNT", "Upper limit on the points of the coordinate search that ends a study."),
+    ] = 100,
+    robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 12,
+    plants: options.PlantsOption = "kinematic",
+    place: options.Place,
+    offset: Annotated[
+        int,
+        option("INTEGER", "First seed, counted from the beginning of the range kept for tuning."),
+    ] = 0,
+    study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
+    check: Annotated[
+        bool,
+        switch(
+            "--check",
+            "Change each tuned value in use one by one instead, and name changes that are better.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")
+    ] = (Path("results") / "tuning"),
+) -> None:
+    """Search for the best settings of each method.
+
+    Every method has the same budget on the same training plants.
+    """
+    from servobench.harness.apps.tuning.campaign import (
+        TuningPlan,
+        check_study_folder,
+        open_methods,
+        write_results,
+    )
+    from servobench.harness.apps.tuning.objective import TuningSet
+    from servobench.harness.apps.tuning.spaces import SPACES, find_tunable
+    from servobench.harness.batch.blocks import open_workers
+    from servobench.harness.batch.lock import locked
+
+    names = selection.split_names("controllers", controllers, tuple(SPACES), find_tunable)
+    with configuration_errors():
+        runs = TuningSet(selection.split("plants", plants), robots, offset)
+        second = runs.second()
+        plan = TuningPlan(names, trials, runs, studies, search, study_seed)
+    check_study_folder(out)
+    opening = open_workers(
+        place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names
+    )
+    with opening as opened, locked(out):
+        if check:
+            _check(out, names, second, opened)
+            return
+        say(
+            f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less"
+        )
+        methods = open_methods(out, plan)
+        interrupted = not _advance(methods, plan, opened)
+    if results := write_results(out, methods):
+        _print_tuned(results)
+    lost = [name for name, tuned in results.items() if tuned.lost]
+    if len(results) > len(lost):
+        say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
+    if interrupted:
+        _end_interrupted(out)
+    if lost:
+        found = f"no run of {', '.join(lost)} came near its target with any settings, so no values are written"
+        raise ConfigurationError(f"{found}; servobench run with the same plant may say why")
+
+
+def _counted(plan: TuningPlan) -> str:
+    """Return how many points and runs a campaign has, without those of its second set of robots."""
+    methods = len(plan.controllers)
+    budget = plan.trials + plan.search
+    runs = len(plan.runs.runs())
+    points = methods * plan.studies * budget
+    compared = "1 method" if methods == 1 else f"{methods} methods"
+    factors = f"{compared} × {plan.studies} studies × {budget} points × {runs} runs"
+    return f"{factors} = {points * runs} runs"
+
+
+def _end_interrupted(out: Path) -> NoReturn:
+    end_interrupted(f"finished points are kept in {out}", "the same call continues")
+
+
+def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
+    """Score every change of one value of the settings in use and say which of them improve a score by too much."""
+    from servobench.harness.apps.tuning.campaign import TOLERANCE, Check, improvements
+    from servobench.harness.cli.progress import Bars
+
+    checked = Check(folder, names, runs)
+    total, begun = len(checked), checked.known()
+    try:
+        with Bars(console) as bars:
+            bar = bars.begin("points", total, begun)
+            for done, _ in enumerate(checked.carry_out(workers), begun + 1):
+                bars.reach(bar, done, f"{done} of {total} points")
+    except KeyboardInterrupt:
+        _end_interrupted(folder)
+    found = improvements(checked.changes())
+    if not found:
+        say(f"no change improves a score by more than {TOLERANCE:.0%}")
+        return
+    rows = []
+    for change in found:
+        values = (
+            f"{value:.4g}" if isinstance(value, float) else str(value)
+            for value in (change.before, change.after)
+        )
+        scores = f"{change.score_before:.4f}", f"{change.score_after:.4f}", f"{change.gain:.1%}"
+        rows.append((change.controller, change.key, *values, *scores))
+    print_rows(("controller", "key", "in use", "better", "score", "with the change", "gain"), rows)
+    sys.exit(FAILED)
+
+
+def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> bool:
+    """Advance the studies to their end and show how far they are; return whether they got there."""
+    from rich.progress import TextColumn
+
+    from servobench.harness.apps.tuning.campaign import advance
+    from servobench.harness.cli.progress import Bars
+
+    total = plan.studies * (plan.trials + plan.search)
+    try:
+        with Bars(console, TextColumn("points, best {task.fields[best]}")) as bars:
+            shown = {
+                method.name: bars.begin(method.name, total, method.done, best="–")
+                for method in methods
+            }
+            for method in advance(methods, plan, workers):
+                score = method.ledger.best()
+                best = "–" if score is None else f"{score:.4f}"
+                done = sum(each.done for each in methods)
+                text = f"{method.done} of {total} points, best {best}; in all {done} of {total * len(methods)}"
+                bars.reach(shown[method.name], method.done, f"{method.name}: {text}", best=best)
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def _print_tuned(results: Mapping[str, TunedValues]) -> None:
+    rows = []
+    for name, tuned in results.items():
+        numbers = (
+            tuned.score_of_defaults,
+            tuned.score,
+            tuned.second_score_of_defaults,
+            tuned.second_score,
+        )
+        spread = " ".join(f"{study.second_score:.4f}" for study in tuned.studies)
+        rows.append((name, *(f"{number:.4f}" for number in numbers), spread))
+    print_rows(
+        (
+            "controller",
+            "score of defaults",
+            "score tuned",
+            "second set, defaults",
+            "tuned",
+            "its studies",
+        ),
+        rows,
+    )
+    for name, tuned in results.items():
+        for edge in tuned.edges:
+            say(f"{name}: {edge}; with these values in use the next study searches a wider box")

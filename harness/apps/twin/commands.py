@@ -1,0 +1,193 @@
+"""The commands `servobench shadow | identify`: what a log says about a controller, and about an arm."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import CONTROLLER, option
+from servobench.harness.cli.terminal import FAILED, console, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import accessing, user_path, write_atomically, write_csv
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from servobench.harness.run.resolution import ResolvedRun
+
+IDENTIFYING: Final = "constant"  # a controller, which identification does not run
+PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that is easier to write
+LOG = typer.Argument(
+    help="Results folder, or a table (.csv, .parquet) with the columns of its steps."
+)
+LEGEND: Final = (
+    "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
+    "The log does not answer to the controller, so that this does not say how well it would have done."
+)
+
+
+def shadow(
+    log: Annotated[Path, LOG],
+    controller: Annotated[
+        str | None, option(CONTROLLER, "Name or file of the controller; default: that of the run.")
+    ] = None,
+    run: options.RunIdOption = None,
+    robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
+    out: Annotated[
+        Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")
+    ] = None,
+) -> None:
+    """Compare commands and predictions of a controller with a log.
+
+    Nothing is simulated: its commands do not change the log. Its Jacobian predicts each feature from the frame before.
+    """
+    from servobench.harness.apps.twin.shadow import differences, predictions
+    from servobench.harness.apps.twin.shadow import shadow as see
+    from servobench.harness.config.registry import find_controller
+
+    chosen = None if controller is None else selection.choose("controllers", controller)
+    if chosen is not None and find_controller(chosen).needs_truth and not log.is_dir():
+        raise ConfigurationError(
+            f"controller {chosen} is given the true robot, which {log} does not have"
+        )
+    resolved, table = _logged(log, run, chosen, (robot, sensing), out)
+    with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
+        seen = see(resolved, table)
+    name, apart, ahead = resolved.request.controller, differences(seen), predictions(seen)
+    if out is not None:
+        with accessing(out):
+            write_csv(seen, out)
+        say(f"table in {out}")
+    elif apart.empty and ahead.empty:
+        raise ConfigurationError(
+            f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller"
+        )
+    if ahead.empty:
+        say(f"{name} gives no Jacobian that could predict a feature")
+    titles = f"{name} beside the log", f"Features one frame ahead, by the Jacobian of {name}"
+    tables = [
+        (title, rows) for title, rows in zip(titles, (apart, ahead), strict=True) if not rows.empty
+    ]
+    words = [
+        (title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}"))
+        for title, rows in tables
+    ]
+    print_tables(words, LEGEND)
+
+
+def identify(
+    log: Annotated[Path, LOG],
+    run: options.RunIdOption = None,
+    robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
+    out: Annotated[
+        Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")
+    ] = None,
+) -> None:
+    """Identify arm, camera and drive from a log, as a twin.
+
+    A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
+    """
+    from servobench.harness.apps.twin.drive import command_response
+    from servobench.harness.apps.twin.identification import read_log
+    from servobench.harness.apps.twin.preflight import mistakes
+    from servobench.harness.apps.twin.twin_file import estimates, remarks, twin_text
+    from servobench.harness.batch.logs import UnevenRows
+    from servobench.harness.run.experiment import build
+    from servobench.harness.run.request import RunSettings, find_sensing
+    from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
+
+    try:
+        resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
+    except UnevenRows as error:
+        say(str(error))
+        sys.exit(FAILED)
+    request = resolved.request
+    setup, own = find_sensing(request.sensing), find_robot(request.robot)
+    if own.twin:
+        wanted = f"identify a table, such as steps.parquet, with --robot {own.twin.keys.robot}"
+        raise ConfigurationError(
+            f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}"
+        )
+    if (
+        not log.is_dir()
+    ):  # a table does not say at which speed commands are clipped: at that of the robot
+        resolved = replace(
+            resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
+        )
+    experiment = build(resolved)
+    rows = read_log(experiment.plant.spec, table)
+    experiment.plant.close()
+    apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
+    with console.status(f"identifying {request.robot} in {len(table)} rows"):
+        mistake, found = mistakes(
+            rows, setup.nominal(own), lambda: {k: setup.nominal(find_robot(k)) for k in apart}
+        )
+        response = command_response(rows)
+    if found is None:
+        say(f"{log}: {mistake}")
+        sys.exit(FAILED)
+    print_tables(
+        [(f"{log} against the nominal {own.title}, where they differ", estimates(found, response))]
+    )
+    say("\n".join(remarks(rows, found, response)))
+    if out is not None:
+        with accessing(out):
+            folder = out.resolve().parent  # where the twin looks for files first
+            named = with_files(
+                request.robot,
+                lambda file: (
+                    os.path.relpath(user_path(file), folder) if user_path(file).is_file() else file
+                ),
+            )
+            text = twin_text(found, rows, response, (named, request.sensing))
+            write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+        next_one = f"servobench compare --robot {quote(str(out))} --plants kinematic"
+        if abs(resolved.run.period - RunSettings.period) > PERIOD_TOLERANCE * RunSettings.period:
+            next_one += f" --set run.period={_as_clock(resolved.run.period)}"
+        say(f"twin in {out}; the next command: {next_one}")
+
+
+def _as_clock(period: float) -> str:
+    """Return a control period [s] as users write it: in whole milliseconds, as a rate in whole Hz, or as it is."""
+    if math.isclose(round(period, 3), period, rel_tol=PERIOD_TOLERANCE):
+        return f"{round(period, 3):g}"
+    if math.isclose(round(1.0 / period), 1.0 / period, rel_tol=PERIOD_TOLERANCE):
+        return f"{round(1.0 / period)}Hz"
+    return f"{period:.6g}"
+
+
+def _logged(
+    log: Path, run: str | None, controller: str | None, named: tuple[str, str], out: Path | None
+) -> tuple[ResolvedRun, DataFrame]:
+    """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
+    from servobench.harness.batch.logs import logged_in_file, logged_in_folder
+
+    if not log.exists():
+        raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
+    if out is not None and out.exists() and out.samefile(log):
+        raise ConfigurationError(f"--out {out} is the log itself; name another file")
+    if log.is_dir():
+        resolved, table = logged_in_folder(log, run, controller, named[1])
+        for word, given, usual in (("robot", named[0], "ur5"), ("sensing", named[1], "position")):
+            if given not in (usual, own := getattr(resolved.request, word)):
+                raise ConfigurationError(
+                    f"--{word} {given} is not that of the run, {own}; leave it out for a folder"
+                )
+        return resolved, table
+    if run is not None:
+        raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
+    if controller is None:
+        raise ConfigurationError(
+            f"{log} does not say which controller to show it to; name one with --controller"
+        )
+    return logged_in_file(log, controller, *named)

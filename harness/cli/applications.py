@@ -1,0 +1,95 @@
+"""The commands by their modules, and the applications: abilities that only their commands reach.
+
+The core stands without the applications, and nothing in it imports one: the command line finds a command here by its
+name and imports no other. A further application is a folder of `harness/apps` with `commands.py`, and a row here.
+"""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, Final, NamedTuple
+
+import typer
+
+from servobench.harness.cli.options import command
+
+HARNESS: Final = "servobench.harness"
+
+
+class Application(NamedTuple):
+    """An application: a room of the house that only its commands lead to."""
+
+    purpose: str
+    commands: tuple[str, ...] = ()
+    extra: str = ""
+    """the extra of pyproject.toml that it needs; empty for none"""
+    package: str = ""
+    """where it lies elsewhere than in `harness/apps`"""
+    further: tuple[str, ...] = ()
+    """packages beside it that nothing else imports"""
+
+
+APPLICATIONS: Final = {
+    "twin": Application("arm, camera and drive identified from a log", ("shadow", "identify")),
+    "serve": Application("a plant on the ports of a UR", ("serve",)),
+    "check": Application("a plug-in begun, and held against its contract", ("new", "check")),
+    "fmu": Application(
+        "arms and controllers as FMUs", ("fmu",), further=("servobench.fmus.controllers",)
+    ),
+    "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
+    "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
+    "studies": Application(
+        "claims, challenges and the robustness map", ("robustness", "suite", "claims")
+    ),
+    "films": Application("films and snapshots of runs", ("record",), "animation"),
+    "report": Application("a page about a results folder", ("report",), "report"),
+    "loops": Application("loops at rest: margins and limits", ("analyse",)),
+}
+CORE: Final = {  # module of harness/cli -> its commands
+    "runs": ("run", "compare", "sweep", "train", "merge"),
+    "results": ("statistics", "figures", "collect", "export", "verify"),
+    "lists": ("plants", "controllers", "tasks", "sensing", "init"),
+}
+PANELS: Final = {  # title on the help page -> commands, in the order of first use
+    "First steps": ("run", "compare", "statistics", "report", "figures", "record"),
+    "Your own controller": ("new", "check", "shadow", "identify", "serve"),
+    "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
+    "Studies": ("sweep", "analyse", "robustness", "suite", "claims", "tune"),
+    "Tools": ("train", "collect", "merge", "export", "verify", "fmu"),
+}
+
+
+def home_of(name: str) -> str:
+    """Return the module that holds a command."""
+    homes = {each: f"{HARNESS}.cli.{module}" for module, names in CORE.items() for each in names}
+    for application, row in APPLICATIONS.items():
+        package = row.package or f"{HARNESS}.apps.{application}"
+        homes.update(dict.fromkeys(row.commands, f"{package}.commands"))
+    return homes[name]
+
+
+def find_command(name: str) -> Any:  # noqa: ANN401 - a function, or a group of typer
+    """Return the function of a command, or the group of commands of this name; its module is imported."""
+    return getattr(import_module(home_of(name)), name)
+
+
+def assemble(called: str, callback: Callable[..., None]) -> typer.Typer:
+    """Return the command line with the command that is called alone, or with all where there is none of this name.
+
+    Args:
+        called: first word of the call.
+        callback: takes the options that stand before a command.
+    """
+    names = {"help_option_names": ["-h", "--help"]}
+    app = typer.Typer(context_settings=names, pretty_exceptions_enable=False)
+    app.callback()(callback)
+    known = {name for commands in PANELS.values() for name in commands}
+    for title, commands in PANELS.items():
+        for name in commands:
+            if called in known and name != called:
+                continue
+            found = find_command(name)
+            if isinstance(found, typer.Typer):
+                app.add_typer(found, name=name, rich_help_panel=title)
+            else:
+                app.command(rich_help_panel=title)(command(found))
+    return app
