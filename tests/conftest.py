@@ -37,6 +37,8 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.mkdtemp(prefix="servobench-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
+    # Some containers set it, and each of many subprocesses would compile the package anew
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     if shutil.which("cc") and "SERVOBENCH_NIGHTLY" not in os.environ:
         # Optimising an FMU takes longer than to run it
         os.environ.setdefault("CC", """sh -c 'cc "$@" -O0' cc""")
