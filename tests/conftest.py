@@ -37,6 +37,9 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.mkdtemp(prefix="servobench-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
+    if (cache := getattr(config, "cache", None)) is not None:
+        # Seconds go into a list of the machine's fonts, which stays the same from session to session
+        os.environ["MPLCONFIGDIR"] = str(cache.mkdir("matplotlib"))
     # Some containers set it, and each of many subprocesses would compile the package anew
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     if shutil.which("cc") and "SERVOBENCH_NIGHTLY" not in os.environ:
