@@ -26,6 +26,7 @@ import math
 import os
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, Self, TypeAlias, final
 
@@ -166,26 +167,9 @@ class TuningSet:
 
     def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a world one after the other."""
-        count = len(KINDS) * self.robots
-        seeds = tuning_seeds(count, self.offset)
-        models = self._drawn("model", MODELS, count)
-        level = {name: self._drawn(name, levels, len(KINDS)) for name, levels in LEVELS.items()}
-        runs = []
-        for plant in self.plants:
-            known = flatten(find_plant(plant).config())
-            for run, (seed, model) in enumerate(zip(seeds, models, strict=True)):
-                world = run // self.robots
-                task, varied = KINDS[world]
-                # Rendered drives have no setting for their overshoot.
-                drive = [pair for pair in level["drive"][world] if _setting(pair[0]) in known]
-                noise = ("noise", level["noise"][world])
-                latency = ("latency", level["latency"][world])
-                own = (*varied, *drive, noise, latency)
-                mismatch = read_mismatch(model + level["detector"][world])
-                runs.append(RunRequest(plant, "", task, mismatch, seed, own))
-        return runs
+        return list(_runs_of(self))
 
-    def _drawn(self, name: str, levels: Sequence[Any], count: int) -> list[Any]:
+    def drawn(self, name: str, levels: Sequence[Any], count: int) -> list[Any]:
         """Return `count` levels, each as often as the others as far as possible, in an order drawn for this set."""
         order = named_generator(self.offset, name).permutation(count)
         return [levels[index % len(levels)] for index in order]
@@ -195,6 +179,29 @@ class TuningSet:
         curve = next(world for world, (task, _) in enumerate(KINDS) if task != MOVE)
         robots = range(min(2, self.robots))
         return [world * self.robots + robot for world in (0, curve) for robot in robots]
+
+
+@cache  # it is asked for every point, and words of a mismatch may name files
+def _runs_of(own: TuningSet) -> tuple[RunRequest, ...]:
+    """Return the runs of a set; see `TuningSet.runs`."""
+    count = len(KINDS) * own.robots
+    seeds = tuning_seeds(count, own.offset)
+    models = own.drawn("model", MODELS, count)
+    level = {name: own.drawn(name, levels, len(KINDS)) for name, levels in LEVELS.items()}
+    runs = []
+    for plant in own.plants:
+        known = flatten(find_plant(plant).config())
+        for run, (seed, model) in enumerate(zip(seeds, models, strict=True)):
+            world = run // own.robots
+            task, varied = KINDS[world]
+            # Rendered drives have no setting for their overshoot.
+            drive = [pair for pair in level["drive"][world] if _setting(pair[0]) in known]
+            noise = ("noise", level["noise"][world])
+            latency = ("latency", level["latency"][world])
+            values = (*varied, *drive, noise, latency)
+            mismatch = read_mismatch(model + level["detector"][world])
+            runs.append(RunRequest(plant, "", task, mismatch, seed, values))
+    return tuple(runs)
 
 
 def _setting(key: str) -> str:

@@ -9,6 +9,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, read_tuned
 from servobench import controllers
+from servobench.harness.apps.tuning import objective
 from servobench.harness.apps.tuning.campaign import (
     TuningPlan,
     advance,
@@ -44,7 +45,8 @@ TUNED = Path(controllers.__file__).parent / "tuned" / "constant.toml"
 
 @pytest.fixture
 def made_up(monkeypatch):
-    """Runs whose cost is a formula; the list of what was scored."""
+    """Runs whose cost is a formula, and loops that bear any delay; the list of what was scored."""
+    monkeypatch.setattr(objective, "bears_delay", lambda _: True)
     return cost_by_formula(monkeypatch)
 
 
@@ -174,18 +176,25 @@ def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_o
 
 @pytest.mark.parametrize(("gain", "runs"), [(2.5, 1), (29.0, 0)])
 def test_a_loop_with_too_small_a_delay_margin_has_the_worst_cost_without_a_run(
-    made_up, tmp_path, gain, runs
+    monkeypatch, tmp_path, gain, runs
 ):
+    scored = cost_by_formula(monkeypatch)
     ledger = open_ledger(tmp_path, "constant", SMALL)
     point = {**default_values(find_tunable("constant")), "law.proportional_gain": gain}
     assert list(fill([(ledger, "constant", nested_settings(point))], SMALL, Workers())) == [
         "constant"
     ]
-    assert len(made_up) == runs
+    assert len(scored) == runs
     assert (score(ledger.costs(nested_settings(point))) == pytest.approx(WORST)) == (runs == 0)
 
 
-def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_hold(tmp_path):
+def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_hold(
+    monkeypatch, tmp_path
+):
+    brief = {objective.MOVE: {"duration": 1.0}}
+    brief |= dict.fromkeys(("circle", "lemniscate"), {"radius": 0.1, "lap_time": 1.0})
+    monkeypatch.setattr(objective, "TASKS", brief)
+    monkeypatch.setattr(objective, "SECOND_FACTOR", 1)
     plan = replace(
         plan_of("broyden:published", trials=2, studies=2, search=1), runs=TuningSet(robots=1)
     )
@@ -195,7 +204,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     (tuned,) = written.values()
     assert read_tuned(tmp_path / "one" / "broyden.published.toml") == tuned
     assert TuningSet(tuned.plants, tuned.robots, tuned.offset) == plan.runs
-    assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (8, 24)
+    assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (8, 8)
     assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [
         (0, 2, 1),
         (1, 2, 1),
