@@ -192,7 +192,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     monkeypatch, tmp_path
 ):
     brief = {objective.MOVE: {"duration": 1.0}}
-    brief |= dict.fromkeys(("circle", "lemniscate"), {"radius": 0.1, "lap_time": 1.0})
+    brief |= {task: {"radius": 0.1, "lap_time": 1.0} for task in ("circle", "lemniscate")}
     monkeypatch.setattr(objective, "TASKS", brief)
     monkeypatch.setattr(objective, "SECOND_FACTOR", 1)
     plan = replace(
