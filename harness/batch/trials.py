@@ -145,7 +145,9 @@ def try_all(word: Word, robot: str) -> list[Tried]:
         name: point for name in registry.names() if (point := registry.published(name)) is not None
     }
     if points:
-        import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each isolated process
+        # Once, and not in each isolated process
+        import servobench.harness.run.experiment  # noqa: PLC0415
+        import servobench.plant.kinematic  # noqa: F401, PLC0415
     return [
         _try(word, points[name], robot) if name in points else _try_here(word, name)
         for name in registry.names()

@@ -50,7 +50,7 @@ class Crash(Mine):
 
 class Hang(Mine):
     def __init__(self, knowledge):
-        while True: pass
+        while True: time.sleep(0.1)
 
 
 class Ends(Mine):
@@ -62,7 +62,7 @@ class Falls(Mine):
     def __init__(self, knowledge):
         ctypes.string_at(0)
 """
-).replace("import numpy", "import ctypes\nimport os\n\nimport numpy")
+).replace("import numpy", "import ctypes\nimport os\nimport time\n\nimport numpy")
 MODULES = {
     "crash": "1 / 0\n",
     "end": "import os\n\nos._exit(0)\n",
@@ -91,9 +91,9 @@ NEEDY = servobench.PlantEntry("needy", "", type(NEEDY), Cell)
 CONTROLLERS = {
     "import-error": "controller 'import-error' (some_crash:ENTRY) cannot be loaded: site/some_crash.py:1: "
     "ZeroDivisionError: division by zero",
-    "half": "controller 'half' (some_law:Half) cannot be used: site/some_law.py:35: class Half lacks reset and step, "
+    "half": "controller 'half' (some_law:Half) cannot be used: site/some_law.py:36: class Half lacks reset and step, "
     "which it must define",
-    "crash": "controller crash: site/some_law.py:41: AttributeError: 'RobotKnowledge' object has no attribute 'size'",
+    "crash": "controller crash: site/some_law.py:42: AttributeError: 'RobotKnowledge' object has no attribute 'size'",
     "gone": "controller 'gone' (some_law:Nothing) cannot be loaded: AttributeError: module 'some_law' has no attribute "
     "'Nothing'",
     "a/b": "controller 'a/b' (some_law:Mine) cannot be used: some_law:Mine: the name must be letters, digits and _, "
@@ -103,9 +103,9 @@ CONTROLLERS = {
 REMEDY = "raise an error instead, so that the other runs go on"
 WAITS = "no answer after 3 s; is there a loop without an end, or something that waits?"
 HARMFUL = {  # what only a process of its own survives
-    "hang": f"controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:46: {WAITS}",
+    "hang": f"controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:47: {WAITS}",
     "ends": f"controller 'ends' (some_law:Ends) cannot be used: it ended the process with exit code 3; {REMEDY}",
-    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:56: it killed the process by "
+    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:57: it killed the process by "
     "SIGSEGV; compiled code wrote or read outside of its memory",
     "import-ends": "controller 'import-ends' (some_end:Mine) cannot be used: it ended the process with exit code 0; "
     f"{REMEDY}",
