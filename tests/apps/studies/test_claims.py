@@ -1,7 +1,7 @@
 """The answers to the paper's claims: the rules on tables with a known outcome, and the command on real runs."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pandas as pd
@@ -71,17 +71,29 @@ def table(seed: int, **changes) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+@cache
+def usual_table() -> pd.DataFrame:
+    return table(0)
+
+
 def tables(**changes) -> dict[str, pd.DataFrame]:
     every = table(0, **changes)
     made = {MAIN: every.assign(controller_time_median_us=np.nan), TIMED: every}
+    usual = usual_table()
+    alone = usual[usual["controller"] == PROPOSED]
     for name in (FROZEN, NO_EPSILON, ENTRIES):
-        other = table(0)
-        made[name] = other[other["controller"] == PROPOSED].reset_index(drop=True)
+        made[name] = alone.reset_index(drop=True)
     return made
 
 
 def proposed(amount: float, tasks=(*MOVES, CIRCLE)):
     return lambda controller, task: amount if controller == PROPOSED and task in tasks else 0.0
+
+
+@cache
+def usual_answers():
+    """Return the answers where all methods are alike."""
+    return answer_all(tables(), "kinematic")
 
 
 def verdicts(made: dict[str, pd.DataFrame]) -> dict[str, str]:
@@ -199,7 +211,7 @@ def test_where_no_run_reached_its_last_period_nothing_is_answered():
     ("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)]
 )
 def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, number, same):
-    answer = answer_all(tables(), "kinematic")[0]
+    answer = usual_answers()[0]
     write_tables([replace(answer, evidence="circle 10.0 [9.0, 12.5] mm in 38 of 40")], tmp_path)
     found = [replace(answer, evidence=f"circle {number} mm in 37 of 40")]
     assert (differences(found, read_answers(tmp_path / "answers.csv")) == []) == same
@@ -207,13 +219,13 @@ def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, num
 
 def test_a_table_of_answers_for_which_there_is_no_room_is_named_and_not_half_there(tmp_path):
     with no_file_above(10), pytest.raises(OSError, match="File too large") as caught:
-        write_tables(answer_all(tables(), "kinematic"), tmp_path)
+        write_tables(usual_answers(), tmp_path)
     assert caught.value.filename == str(tmp_path / "answers.csv")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_committed_table_is_compared_line_by_line(tmp_path):
-    answers = answer_all(tables(), "kinematic")
+    answers = usual_answers()
     write_tables(answers, tmp_path)
     wanted = read_answers(tmp_path / "answers.csv")
     assert differences(answers, wanted) == []
@@ -233,7 +245,7 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
 
 
 def test_an_answer_that_is_another_on_a_second_engine_is_marked():
-    first = replace(answer_all(tables(), "kinematic")[0], plant="bullet", verdict=REPRODUCED)
+    first = replace(usual_answers()[0], plant="bullet", verdict=REPRODUCED)
     second = replace(first, plant="mujoco", verdict="depends: holds in 2 of 4")
     answers = [first, second, replace(second, division="as published")]
     assert [elsewhere(a, answers) for a in answers] == [
@@ -283,13 +295,13 @@ def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(refusal_of
 
 
 def test_every_answer_is_in_the_table():
-    answers = answer_all(tables(), "kinematic")
+    answers = usual_answers()
     assert len(answers) == 9
     assert markdown_table(answers).count("\n") == 11
 
 
 def test_an_answer_without_a_number_is_drawn_as_png_and_pdf(tmp_path):
-    answer = answer_all(tables(), "kinematic")[0]
+    answer = usual_answers()[0]
     unknown = tuple(replace(each, estimate=NO_ESTIMATE) for each in answer.measurements)
     reproduction.draw_answers([replace(answer, measurements=unknown)], tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"claim_1.png", "claim_1.pdf"}
@@ -304,7 +316,7 @@ def test_no_study_uses_a_seed_that_methods_were_tuned_on():
 
 def brief_studies(*arguments):
     """Return the studies with shorter tasks."""
-    brief = {**{task: {"duration": 2.0} for task in MOVES}, CIRCLE: {"lap_time": 2.0}}
+    brief = {**{task: {"duration": 0.5} for task in MOVES}, CIRCLE: {"lap_time": 0.5}}
     return {
         name: replace(study, settings=Settings({**study.settings.sections, **brief}))
         for name, study in studies(*arguments).items()
