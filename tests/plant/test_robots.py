@@ -11,6 +11,7 @@ from kit.own import assert_remarks, write
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from servobench.plant.rendered.settings import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_tree, text
+from servobench.plant.robot import files, urdf_file
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rotation_from_rpy
 from servobench.plant.robot.catalogue import ROBOTS, find_robot, random_robot
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, nearest_title, read_calibration
@@ -35,6 +36,19 @@ def found(robot):
     """Return the workspace of a robot, found once more."""
     limits, links = robot.limits, robot.links
     return find_workspace(robot.arm, (limits.lower, limits.upper), (links.radius, links.aside))
+
+
+@pytest.fixture(scope="session")
+def four_joints(tmp_path_factory):
+    """The workspace of an arm of four joints."""
+    return robot_of(tmp_path_factory.mktemp("four"), "four.toml", FOUR_JOINTS).workspace
+
+
+@pytest.fixture
+def known_workspace(four_joints, monkeypatch):
+    """Let arms of four joints that are read have a known workspace, which takes a second to find."""
+    for reader in (files, urdf_file):
+        monkeypatch.setattr(reader, "find_workspace", lambda *_: four_joints)
 
 
 @pytest.mark.parametrize("title", UNIVERSAL_ROBOTS)
@@ -272,6 +286,7 @@ def test_a_wrong_dh_table_is_named(tmp_path, before, after, message):
         robot_of(tmp_path, "arm.toml", FOUR_JOINTS.replace(before, after))
 
 
+@pytest.mark.usefixtures("known_workspace")
 def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog):
     cases = [
         (
@@ -298,6 +313,7 @@ def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog):
     assert_remarks(caplog, partial(robot_of, tmp_path, "arm.toml"), FOUR_JOINTS, cases)
 
 
+@pytest.mark.usefixtures("known_workspace")
 def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
     pytest.importorskip("yourdfpy")
     cases = [
@@ -321,6 +337,7 @@ def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
     assert_remarks(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, cases)
 
 
+@pytest.mark.usefixtures("known_workspace")
 def test_a_body_of_a_urdf_has_the_nearest_possible_inertia(tmp_path):
     """Least squares: both small moments grow by a third of what they lack together, and the largest shrinks as much."""
     pytest.importorskip("yourdfpy")
@@ -432,6 +449,7 @@ def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
     assert "estimated: torque limits" in read.note
 
 
+@pytest.mark.usefixtures("known_workspace")
 def test_a_link_has_the_mass_of_all_that_hangs_on_it(tmp_path):
     pytest.importorskip("yourdfpy")
     links = robot_of(tmp_path, "arm.urdf", HEAVY).links
@@ -486,6 +504,7 @@ def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
     assert find_robot("random_arm:1") is one
 
 
+@pytest.mark.usefixtures("known_workspace")
 def test_a_robot_file_takes_units(tmp_path):
     plain = robot_of(tmp_path, "arm.toml", FOUR_JOINTS)
     written = robot_of(tmp_path, "units/arm.toml", FOUR_JOINTS.replace("d = [0.35", 'd = ["350mm"'))
