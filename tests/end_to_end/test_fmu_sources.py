@@ -20,7 +20,7 @@ PRODUCTS = {
 }
 
 NEEDS_TIDY = pytest.mark.skipif(shutil.which("clang-tidy") is None, reason="needs clang-tidy")
-CALLS = 100_000
+CALLS = 20_000
 
 
 @NEEDS_TIDY

@@ -123,7 +123,7 @@ def test_an_fmu_has_the_name_that_a_user_gives_it(output_of):
         "--no-figures",
         "--no-report",
         "--workers",
-        "2",
+        "1",
         "--out",
         "runs",
     )
