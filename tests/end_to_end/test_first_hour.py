@@ -46,6 +46,8 @@ LONG = {  # words of a block that only `make nightly` carries out -> processor t
     "ur5_severe.fmu": 7,
     "stereo.fmu": 4,
 }
+# Words of a session with a prompt that only `make nightly` carries out -> processor time [s]
+LONG_SESSIONS = {"--tasks circle --seeds 3 --no-report": 18}
 SHIMS = {
     "servobench": 'exec "{python}" -m servobench "$@"',
     "python": 'exec "{python}" "$@"',
@@ -135,9 +137,9 @@ def reader(monkeypatch, tmp_path):
 def test_what_a_page_shows_is_what_comes_out(reader, monkeypatch, capsys, page):
     text = read(f"{page}.md")
     lay_out(reader, text)
-    count = console.carry_out(
-        text, monkeypatch, capsys, reader.folder, reader.paste if page in HOUR else None
-    )
+    paste = reader.paste if page in HOUR else None
+    left_out = () if NIGHTLY else LONG_SESSIONS
+    count = console.carry_out(text, monkeypatch, capsys, reader.folder, paste, left_out)
     assert count > 0 or page in HOUR
 
 
@@ -155,3 +157,10 @@ def test_the_first_hour_begins_the_site_its_pages_leave_folders_of_their_own_and
     assert [
         words for words in (*LEFT_OUT, *LONG) if not any(words in block for block in pasted)
     ] == []
+    sessions = [
+        " ".join(what)
+        for text in texts
+        for kind, what, _ in console.steps(text)
+        if kind == "command"
+    ]
+    assert all(any(words in line for line in sessions) for words in LONG_SESSIONS)
