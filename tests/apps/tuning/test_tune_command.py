@@ -35,6 +35,7 @@ def _short_runs(monkeypatch):
     monkeypatch.setattr(
         objective, "TASKS", {name: task | short[name] for name, task in objective.TASKS.items()}
     )
+    monkeypatch.setattr(objective, "SECOND_FACTOR", 1)  # instead of three times the runs of a trial
 
 
 def test_code_of_users_has_no_search_space_and_is_not_imported(refusal_of, tmp_path):
