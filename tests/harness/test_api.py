@@ -13,6 +13,7 @@ import pytest
 
 import servobench
 from kit.command import judged, python
+from kit.nightly import some
 from kit.resting import Resting
 from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.faults import ConfigurationError
@@ -69,7 +70,10 @@ def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_re
             servobench.run(f"{tmp_path}/{place}")
 
 
-@pytest.mark.parametrize("how", ["run_memory=2e9", "workers=2, out='out'"])
+HOW = ("run_memory=2e9", "workers=2, out='out'")  # both start workers, the latter two
+
+
+@pytest.mark.parametrize("how", some(HOW, HOW[0]))
 def test_a_script_without_a_guard_gets_one_line_and_nothing_of_its_workers(tmp_path, how):
     (tmp_path / "script.py").write_text(
         f"import servobench\nservobench.compare(['constant'], seeds=2, {how})\n"
