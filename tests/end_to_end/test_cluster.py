@@ -21,8 +21,8 @@ pytestmark = pytest.mark.skipif(
     find_spec("distributed") is None, reason="the extra 'cluster' is not installed"
 )
 
-SEEDS = ("--seeds", "30", "--set", "random.duration=3")
-RUNS = 120  # the first block is there long before the last
+SEEDS = ("--seeds", "20", "--set", "random.duration=1.5")
+RUNS = 80  # the first block is there long before the last
 
 
 @pytest.fixture
