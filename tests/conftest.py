@@ -1,5 +1,6 @@
 """Numpy errors raise in tests, examples stay the same, the user's cache is not touched, and interrupts arrive."""
 
+import contextlib
 import gc
 import os
 import shutil
@@ -37,9 +38,11 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.mkdtemp(prefix="servobench-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
-    if (cache := getattr(config, "cache", None)) is not None:
+    cache = getattr(config, "cache", None)
+    if cache is not None:
         # Seconds go into a list of the machine's fonts, which stays the same from session to session
-        os.environ["MPLCONFIGDIR"] = str(cache.mkdir("matplotlib"))
+        with contextlib.suppress(OSError):  # of a checkout that cannot be written
+            os.environ["MPLCONFIGDIR"] = str(cache.mkdir("matplotlib"))
     # Some containers set it, and each of many subprocesses would compile the package anew
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     if shutil.which("cc") and "SERVOBENCH_NIGHTLY" not in os.environ:
