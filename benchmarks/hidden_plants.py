@@ -15,9 +15,10 @@ from servobench.harness.apps.twin.drive import command_response
 from servobench.harness.apps.twin.identification import read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build, draw_robot
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.resolution import resolve
+from servobench.harness.run.sampling import draw_robot
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.twin import TOOL, parameter_names

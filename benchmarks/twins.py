@@ -38,9 +38,10 @@ from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.apps.twin.twin_file import twin_text
 from servobench.harness.config.description import toml
 from servobench.harness.config.settings import Settings, flatten, nest
-from servobench.harness.run.experiment import build, draw_robot
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import SHORT_NAMES, RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.resolution import resolve
+from servobench.harness.run.sampling import draw_robot
 from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
 from servobench.plant.robot.mechanics import MECHANICS_AXES

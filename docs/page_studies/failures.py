@@ -25,10 +25,10 @@ from servobench.harness.analysis.comparison import settling_times, success_rate
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import figure_style, method_styles, plain_logarithms
-from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections, select
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.sampling import draw
 
 CAUSES = {
     "camera_angle": "camera turned by [deg]",

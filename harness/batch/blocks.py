@@ -50,7 +50,7 @@ from servobench.harness.batch.processes import Bounds, Limits, available_process
 from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile, check_present_folder
 from servobench.harness.run import episode
-from servobench.harness.run.experiment import build_once
+from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import COMPLETED, CRASHED, LOST, Ending, RunResult, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors

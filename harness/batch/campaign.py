@@ -40,8 +40,8 @@ from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.tables import refuse_nameless, writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
+from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import (
     ResolvedRun,

@@ -176,7 +176,7 @@ def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
             else installed_plant(name, load=robot is not None)
         )
         if robot is not None:
-            from servobench.harness.run.experiment import try_to_build  # noqa: PLC0415 - lists load no runner
+            from servobench.harness.run.rehearsal import try_to_build  # noqa: PLC0415 - lists load no runner
 
             try_to_build(word, name, robot)
     except ConfigurationError as error:

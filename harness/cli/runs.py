@@ -222,9 +222,9 @@ def train(
     They are trained on the nominal model and kept for later runs. Prints their errors.
     """
     from servobench.harness.cli.progress import telling
-    from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.resolution import check_settings
     from servobench.harness.run.result import NETWORKS
+    from servobench.harness.run.training import train_networks
     from servobench.plant.contract.cache import cache_folder
 
     settings, controller = overrides.settings(), selection.choose("controllers", controller)

@@ -15,13 +15,8 @@ from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import (
-    Drawn,
-    Experiment,
-    build,
-    build_together,
-    check_possible,
-)
+from servobench.harness.run.experiment import Experiment, build, build_together
+from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import (
@@ -32,6 +27,7 @@ from servobench.harness.run.request import (
     read_seed,
 )
 from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
+from servobench.harness.run.sampling import Drawn
 from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray, as_array

@@ -15,14 +15,7 @@ from servobench.harness.config.registry import engine_of
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.contract import held_to_contract
-from servobench.harness.run.experiment import (
-    Drawn,
-    Experiment,
-    build,
-    build_together,
-    draw,
-    naming_the_lack,
-)
+from servobench.harness.run.experiment import Experiment, build, build_together, naming_the_lack
 from servobench.harness.run.knowledge import keep_networks
 from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.log import StepLog, Steps
@@ -32,6 +25,7 @@ from servobench.harness.run.outcome import find_outcome, pose_errors
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, INSTANT, Ending, RunResult, ends_batch
+from servobench.harness.run.sampling import Drawn, draw
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault

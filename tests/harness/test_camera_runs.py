@@ -14,9 +14,10 @@ from servobench.harness.batch.results import read_manifest
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import starts
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build, draw
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
+from servobench.harness.run.sampling import draw
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.kinematic import ENTRY as KINEMATIC
 

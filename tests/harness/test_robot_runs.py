@@ -16,10 +16,11 @@ from servobench.harness.config import registry
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build, train_networks
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, fitted
+from servobench.harness.run.training import train_networks
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 from servobench.plant.kinematic import ENTRY

@@ -15,12 +15,13 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build, train_networks
+from servobench.harness.run.experiment import build
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.request import RunRequest, find_sensing
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
+from servobench.harness.run.training import train_networks
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command

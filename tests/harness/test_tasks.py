@@ -17,7 +17,7 @@ from kit.resting import Resting
 from servobench.harness.config import registry
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build_once
+from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.tasks import TASKS, choose_task, find_task

@@ -9,8 +9,8 @@ from kit.command import servobench
 from kit.folders import comparison
 from kit.robots import FOUR_JOINTS
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build_once
 from servobench.harness.run.references import FixedPoint
+from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.scenario import Scenario

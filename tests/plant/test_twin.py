@@ -6,9 +6,10 @@ import pytest
 from kit.own import assert_remarks, write
 from kit.robots import FOUR_JOINTS
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build, build_together, draw_robot
+from servobench.harness.run.experiment import build, build_together
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
+from servobench.harness.run.sampling import draw_robot
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command

@@ -31,10 +31,11 @@ from servobench.fmus.product import Product
 from servobench.fmus.variables import INPUT
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.run.experiment import Experiment, build, draw, draw_robot
+from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.request import RunRequest, find_robot
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections, select
+from servobench.harness.run.sampling import draw, draw_robot
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray

@@ -28,7 +28,8 @@ from servobench.harness.apps.serve.program import (
     script_version,
 )
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build, check_possible
+from servobench.harness.run.experiment import build
+from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import RunRequest, find_robot
 from servobench.harness.run.resolution import check_settings, resolve

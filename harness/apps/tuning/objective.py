@@ -40,8 +40,8 @@ from servobench.harness.batch.manifest import named_files, plugins
 from servobench.harness.batch.plan import TUNING, Cell, Survey, tuning_seeds
 from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
-from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
+from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest, RunSettings, Varied, read_mismatch
 from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sections, select
 from servobench.harness.run.result import COMPLETED

@@ -37,8 +37,8 @@ from servobench.harness.apps.twin.twin_file import (
     sensor,
     twin_text,
 )
-from servobench.harness.run.experiment import draw_robot
 from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
+from servobench.harness.run.sampling import draw_robot
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 from servobench.plant.kinematic import KinematicConfig

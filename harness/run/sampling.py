@@ -1,0 +1,147 @@
+"""The sampling of a run: the true robot, its cameras and the task on it, drawn from a mismatch and a seed."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from servobench.harness.config.source import same_folder
+from servobench.harness.run.plausibility import check_extents, check_times
+from servobench.harness.run.request import RunRequest, find_robot, find_sensing
+from servobench.harness.run.resolution import ResolvedRun
+from servobench.harness.run.scenario import Scenario, TaskSetting
+from servobench.harness.run.tasks import TASKS
+from servobench.plant.cameras.placement import CameraDraws
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.seeds import named_seed
+from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.mismatch import MismatchSample, sample_mismatch
+
+POINTS: Final = 12  # points of a curve that are checked
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """The values drawn for one run."""
+
+    scenario: Scenario
+    # The true robot and its cameras; None for a plant that brings its own.
+    true: RobotModel | None = None
+    sample: MismatchSample | None = None  # how it differs from the nominal one
+    moved: RobotModel | None = None  # the true robot after its camera was moved; None if it is not
+    # How cameras differ from those planned; None where they are part of `sample`.
+    cameras: CameraDraws | None = None
+
+    @property
+    def final(self) -> RobotModel | None:
+        """The true robot with the camera as it is at the end of the run."""
+        return self.moved or self.true
+
+    def as_record(self) -> dict[str, object]:
+        """Return all values drawn for robot and cameras, for JSON."""
+        record: dict[str, object] = {}
+        for part in (self.sample, self.cameras):
+            if part is not None:
+                record |= part.as_record()
+        return record
+
+
+def draw(resolved: ResolvedRun) -> Drawn:
+    """Draw the true robot and the task of a run.
+
+    Raises:
+        ConfigurationError: a mismatch or a task that cannot be used.
+    """
+    request = resolved.request
+    robot = find_robot(request.robot)
+    true, sample, cameras = draw_robot(request)
+    moved = sample.moved(true, robot)
+    setting = TaskSetting(
+        true,
+        true.arm.n,
+        true.channel,
+        named_seed(request.seed, "task"),
+        moved,
+        robot,
+        nominal=find_sensing(request.sensing).nominal(robot),
+    )
+    return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
+
+
+@configuration_errors()
+def draw_robot(request: RunRequest) -> tuple[RobotModel, MismatchSample, CameraDraws | None]:
+    """Draw the true robot of a run with its cameras, and return the drawn values, too.
+
+    Raises:
+        ConfigurationError: a robot, sensing or mismatch that cannot be used.
+    """
+    robot = find_robot(request.robot)
+    seed = named_seed(request.seed, "mismatch")
+    arm, sample = sample_mismatch(request.mismatch, robot, seed)
+    sensing = find_sensing(request.sensing)
+    true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
+    if robot.twin is not None:
+        exact = not request.mismatch.moves_robot
+        true = robot.twin.model(sensing.nominal(robot), request.sensing, request.seed, exact=exact)
+    return true, sample, cameras
+
+
+def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
+    """Return the task of a run as it is in a setting.
+
+    Raises:
+        ConfigurationError: a task that cannot be used there, or times that do not fit.
+    """
+    name = resolved.request.task
+    task = resolved.task
+    if setting.model is None and not task.any_robot:
+        others = ", ".join(name for name, entry in TASKS.items() if entry.default.any_robot)
+        why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
+        raise ConfigurationError(f"task {name}: {why}")
+    with configuration_errors(f"task {name}: "):
+        with same_folder():
+            scenario: object = task.scenario(setting)  # That of a user's task may be anything.
+        if not isinstance(scenario, Scenario):
+            raise ConfigurationError(
+                f"its method scenario must return a servobench.Scenario, got {scenario!r}"
+            )
+        points = _points_of(scenario, len(setting.feature.names))
+        last = (resolved.run.periods(scenario.duration) - 1) * resolved.run.period
+        # A move is judged by its settling, whenever its judged part begins.
+        if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:
+            begins = f"begins at {scenario.evaluate_from:g} s"
+            part = f"{begins}, after the last control instant at {last:g} s"
+            raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
+        if name not in TASKS:
+            with configuration_errors(
+                "its scenario differs from one call to the next: ", Exception
+            ):
+                _check_repeated(scenario, points, task.scenario(setting))
+    check_times(resolved, scenario.duration)
+    check_extents(resolved, setting.nominal)
+    return scenario
+
+
+def _points_of(scenario: Scenario, m: int) -> FloatArray:
+    """Return the reference of a scenario at a few instants, (p, m), and refuse one of another shape."""
+    points = np.asarray(scenario.reference.at(checked_instants(scenario)))
+    if points.shape != (POINTS, m) or not np.isfinite(points).all():
+        got = f"shape {points.shape} and {points[:1].tolist()}"
+        raise ConfigurationError(
+            f"its reference must be {m} finite features at {POINTS} instants, got {got}"
+        )
+    return points
+
+
+def checked_instants(scenario: Scenario) -> FloatArray:
+    """Return the instants at which the reference of a scenario is checked, (POINTS,) [s]."""
+    return np.linspace(0.0, scenario.duration, POINTS)
+
+
+def _check_repeated(scenario: Scenario, points: FloatArray, again: Scenario) -> None:
+    """Refuse a task whose second scenario is another one, given points of the first."""
+    repeated = np.array_equal(points, again.reference.at(checked_instants(scenario)))
+    starts: list[Any] = [scenario.start, again.start]
+    if not repeated or not np.array_equal(*starts):
+        raise ConfigurationError("draw from setting.seed alone")
