@@ -14,13 +14,15 @@ from measuring import options
 from servobench.harness.apps.twin.drive import command_response
 from servobench.harness.apps.twin.identification import read_log
 from servobench.harness.apps.twin.preflight import mistakes
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
-from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.sampling import draw_robot
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.twin import TOOL, parameter_names
 
 ARMS = ("ur5", "ur10e", "panda")
@@ -94,7 +96,7 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
     }
     if made.row["status"] != "completed":
         return [about | {"parameter": "", "said": f"the run ended: {made.row['reason']}"}]
-    request = RunRequest(plant, "constant", task, read_mismatch(mismatch), seed, robot=robot)
+    request = RunRequest(plant, "constant", task, Mismatch.parse(mismatch), seed, robot=robot)
     experiment = build(resolve(request, Settings(settings | {})))
     log, nominal = (
         read_log(experiment.plant.spec, made.steps),

@@ -22,7 +22,7 @@ from measuring import options
 from servobench.harness.apps.twin.identification import read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.batch.logs import logged_in_file
-from servobench.harness.run.request import find_sensing
+from servobench.harness.config.sensing import find_sensing
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec

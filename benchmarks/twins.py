@@ -37,11 +37,13 @@ from servobench.harness.apps.twin.identification import read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.apps.twin.twin_file import twin_text
 from servobench.harness.config.description import toml
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings, flatten, nest
 from servobench.harness.run.experiment import build
-from servobench.harness.run.request import SHORT_NAMES, RunRequest, find_sensing, read_mismatch
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.sampling import draw_robot
+from servobench.harness.run.variations import SHORT_NAMES
 from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.catalogue import ROBOTS, find_robot
 from servobench.plant.robot.mechanics import MECHANICS_AXES
@@ -88,7 +90,7 @@ def hidden_plant(challenge: Challenge, seed: int) -> Hidden:
         return Hidden(
             robot, mismatch, sensing["latency"], times, sensing["noise_shape"], Mismatch(), settings
         )
-    given = read_mismatch(challenge.mismatch)
+    given = Mismatch.parse(challenge.mismatch)
     axes = tuple(each for each in given.axes if each[0] in {**SENSOR_AXES, **MECHANICS_AXES})
     words = Mismatch("", axes) if axes else Mismatch()
     return Hidden(
@@ -105,7 +107,7 @@ def hidden_plant(challenge: Challenge, seed: int) -> Hidden:
 def true_text(plant: Hidden, seed: int) -> str:
     """Return a file of a twin that is the plant itself."""
     request = RunRequest(
-        PLANT, "constant", "random", read_mismatch(plant.mismatch), seed, robot=plant.robot
+        PLANT, "constant", "random", Mismatch.parse(plant.mismatch), seed, robot=plant.robot
     )
     true, nominal = (
         draw_robot(request)[0],

@@ -38,7 +38,7 @@ from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_
 from servobench.harness.cli.selection import split
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
-from servobench.harness.run.request import RunRequest, find_robot, read_mismatch
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import check_settings, resolve
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract import cache as entries
@@ -50,6 +50,7 @@ from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping
 from servobench.plant.robot import catalogue
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import FEATURE
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
@@ -97,7 +98,7 @@ def _set(text: str, _: Path) -> None:
 
 
 def _mismatch(text: str, _: Path) -> None:
-    assert read_mismatch(str(read_mismatch(text))) == read_mismatch(text)
+    assert Mismatch.parse(str(Mismatch.parse(text))) == Mismatch.parse(text)
 
 
 def _robot(path: Path) -> None:

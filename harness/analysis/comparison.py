@@ -30,8 +30,9 @@ from servobench.harness.run.outcome import (
     NOT_SETTLED,
     SETTLED,
 )
-from servobench.harness.run.request import RunSettings, varied_columns
+from servobench.harness.run.request import RunSettings
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.variations import varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError

@@ -13,8 +13,8 @@ from servobench.harness.analysis.comparison import FROM_TWIN, shown_value
 from servobench.harness.analysis.tables import PAIR, Tables
 from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
-from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.settings import listed
 
 # Columns, with settings that are varied

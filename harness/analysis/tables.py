@@ -58,10 +58,10 @@ from servobench.harness.run.outcome import (
     SETTLED,
     TARGET_UNREACHABLE,
 )
-from servobench.harness.run.request import SHORT_NAMES, varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import TASKS
+from servobench.harness.run.variations import SHORT_NAMES, varied_columns
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 

@@ -35,7 +35,7 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, read_mismatch, read_seed
+from servobench.harness.run.request import RunRequest, read_seed
 from servobench.harness.run.resolution import check_settings
 from servobench.harness.run.result import RunResult
 from servobench.harness.run.tasks import choose_task
@@ -43,6 +43,8 @@ from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import native, remark
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT
+from servobench.plant.robot.mismatch import Mismatch
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry
@@ -100,7 +102,7 @@ def run(
             choose_plant(plant),
             choose_controller(controller),
             _task_name(task),
-            read_mismatch(mismatch),
+            Mismatch.parse(mismatch),
             seed,
         )
         request = RunRequest(*place, robot=robot, sensing=sensing)

@@ -12,8 +12,9 @@ from servobench.harness.batch import results
 from servobench.harness.config.description import plain, restored
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.config.settings import Settings, flatten, nest
-from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings, varied_in_row
+from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections
+from servobench.harness.run.variations import varied_in_row
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import TIME, numbers_of, read_table

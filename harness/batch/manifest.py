@@ -18,13 +18,13 @@ from servobench.harness.config.registry import (
     Offer,
     find_plant,
 )
+from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
-from servobench.harness.run.request import find_robot, find_sensing, sensing_file, sensing_place
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
-from servobench.plant.robot.catalogue import read_word
+from servobench.plant.robot.catalogue import find_robot, read_word
 
 PACKAGES = (
     "servobench", "numpy", "scipy", "pandas", "pyarrow", "pybullet", "mujoco", "control", "casadi", "fmpy",

@@ -20,19 +20,14 @@ from typing import Any, Final, Generic, Self, TypeVar, overload
 import numpy as np
 
 from servobench.harness.config.registry import find_plant
-from servobench.harness.run.request import (
-    DEFAULT_ROBOT,
-    SHORT_NAMES,
-    RunRequest,
-    Value,
-    Varied,
-    read_mismatch,
-)
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.variations import SHORT_NAMES, Value, Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import parse_toml, split_words
 from servobench.plant.contract.settings import listed, remark
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
 DEFAULT_MISMATCH: Final = "moderate"  # On plants with robots of their own it stands for none.
@@ -73,7 +68,7 @@ class Batch:
                 plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing
             )
 
-        mismatches = [read_mismatch(text) for text in self.mismatches]
+        mismatches = [Mismatch.parse(text) for text in self.mismatches]
         return Grid(
             run, self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
         )
@@ -257,7 +252,7 @@ class SweepPlan:
         """
         for axis, _ in self.axes:
             for text in self.batch.mismatches:
-                if axis in dict(read_mismatch(text).axes):
+                if axis in dict(Mismatch.parse(text).axes):
                     raise ConfigurationError(
                         f"--vary {axis} varies an axis that the mismatch {text!r} has"
                     )

@@ -16,8 +16,8 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from servobench.harness.run.metrics import METRICS
-from servobench.harness.run.request import SHORT_NAMES
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.variations import SHORT_NAMES
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 

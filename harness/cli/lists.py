@@ -63,8 +63,8 @@ def tasks(
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
-    from servobench.harness.run.request import find_robot
     from servobench.harness.run.tasks import choose_task, find_task, fitted, task_names
+    from servobench.plant.robot.catalogue import find_robot
 
     if name:
         name = choose_task(name)
@@ -110,14 +110,15 @@ def init(
     from servobench.harness.config.description import configuration_file
     from servobench.harness.config.registry import find_controller, find_plant
     from servobench.harness.config.settings import Settings
-    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import check_settings, resolve_sections
     from servobench.harness.run.tasks import find_task
+    from servobench.plant.robot.mismatch import Mismatch
 
     split = selection.split
     names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
     requests = [
-        RunRequest(*each, read_mismatch("none"), 0, robot=robot) for each in product(*names)
+        RunRequest(*each, Mismatch.parse("none"), 0, robot=robot) for each in product(*names)
     ]
     settings = overrides.settings()
     check_settings(settings, chain.from_iterable(names))

@@ -190,7 +190,7 @@ def _usage_line(error: typer.TyperException) -> str:
 
 def short_key(option: str) -> str:
     """Return the setting for which an option of sweep is short, for the default plant; empty for other options."""
-    from servobench.harness.run.request import SHORT_NAMES
+    from servobench.harness.run.variations import SHORT_NAMES
 
     short = SHORT_NAMES.get(option.removeprefix("--"))
     if short is None:

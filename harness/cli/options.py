@@ -122,11 +122,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         from servobench.harness.config.registry import offering
 
         if (camera := values.pop("camera", None)) is not None:
-            from servobench.harness.run.request import DEFAULT_ROBOT, with_camera
+            from servobench.plant.robot.catalogue import DEFAULT_ROBOT, with_camera
 
             values["robot"] = with_camera(values["robot"] or DEFAULT_ROBOT, camera)
         if values.get("mismatch") == DEFAULT_MISMATCH and values.get("robot"):
-            from servobench.harness.run.request import find_robot
+            from servobench.plant.robot.catalogue import find_robot
 
             values["mismatch"] = "none" if find_robot(values["robot"]).twin else DEFAULT_MISMATCH
         for name, group in groups.items():

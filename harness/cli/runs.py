@@ -168,7 +168,7 @@ def sweep(
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.plan import SweepPlan
     from servobench.harness.cli.progress import watching
-    from servobench.harness.run.request import SECTIONS
+    from servobench.harness.run.variations import SECTIONS
 
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]

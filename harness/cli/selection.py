@@ -63,16 +63,15 @@ def names_of(kind: Kind) -> Names:
 
             return Names(task_names, choose_task)
         case "mismatch":
-            from servobench.harness.run.request import read_mismatch
-            from servobench.plant.robot.mismatch import PROFILES
+            from servobench.plant.robot.mismatch import PROFILES, Mismatch
 
-            return Names(lambda: list(PROFILES), read_mismatch, begun=_begun_mismatches)
+            return Names(lambda: list(PROFILES), Mismatch.parse, begun=_begun_mismatches)
         case "robot":
             from servobench.plant.robot.catalogue import ROBOTS
 
             return Names(lambda: list(ROBOTS), _find_robot)
         case "sensing":
-            from servobench.harness.run.request import find_sensing, sensing_names
+            from servobench.harness.config.sensing import find_sensing, sensing_names
 
             return Names(sensing_names, find_sensing)
     raise ValueError(f"kind must be plants, controllers or another kind of names, got {kind!r}")
@@ -97,7 +96,7 @@ def _begun_mismatches(word: str) -> Iterable[str]:
 
 
 def _find_robot(word: str) -> str:
-    from servobench.harness.run.request import find_robot
+    from servobench.plant.robot.catalogue import find_robot
 
     say(find_robot(word).note)
     return word

@@ -19,13 +19,7 @@ from servobench.harness.run.experiment import Experiment, build, build_together
 from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
-from servobench.harness.run.request import (
-    DEFAULT_ROBOT,
-    RunRequest,
-    find_robot,
-    read_mismatch,
-    read_seed,
-)
+from servobench.harness.run.request import RunRequest, read_seed
 from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.harness.run.sampling import Drawn
 from servobench.plant.bench.bench import Bench
@@ -38,7 +32,9 @@ from servobench.plant.contract.signals import BoolArray, Command, Observation, P
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Overview, Room
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.mismatch import Mismatch
 
 Floats32: TypeAlias = npt.NDArray[np.float32]
 FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors are clipped
@@ -184,7 +180,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             raise ConfigurationError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         self.render_mode = render_mode
         request = RunRequest(
-            plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing
+            plant, PLACEHOLDER, task, Mismatch.parse(mismatch), 0, robot=robot, sensing=sensing
         )
         given = Settings({} if settings is None else settings)
         check_settings(given, [plant, task])

@@ -32,8 +32,8 @@ from servobench.harness.pictures.style import (
 )
 from servobench.harness.pictures.tracks import Ensembles
 from servobench.harness.run.metrics import METRICS
-from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.checks import FloatArray
 
 SETTLING: Final = "settling_time_s"

@@ -15,10 +15,11 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.knowledge import network_source, nominal_knowledge
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.request import RunSettings, find_robot, find_sensing
+from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.sampling import Drawn, build_scenario, draw
 from servobench.harness.run.scenario import Scenario, TaskSetting
@@ -28,6 +29,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.seeds import named_seed
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import RobotModel, TrueJacobian
 from servobench.plant.robot.mismatch import Mismatch
 

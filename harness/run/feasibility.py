@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from servobench.harness.config.sensing import sensing_file
 from servobench.harness.run.experiment import Experiment
-from servobench.harness.run.request import find_robot, sensing_file
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.sampling import checked_instants
 from servobench.harness.run.scenario import Scenario, Vector
@@ -21,6 +21,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch

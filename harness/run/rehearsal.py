@@ -7,13 +7,14 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.feasibility import check_features, check_possible
-from servobench.harness.run.request import RunRequest, RunSettings, find_robot
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.tasks import task_names
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch
 
 

@@ -8,19 +8,14 @@ import numpy as np
 
 from servobench.harness.config import registry
 from servobench.harness.config.settings import Settings, default_config, flatten, nest
-from servobench.harness.run.request import (
-    DEFAULT_ROBOT,
-    ROLES,
-    RunRequest,
-    RunSettings,
-    Varied,
-    find_robot,
-)
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
+from servobench.harness.run.variations import ROLES, Varied
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import listed, override, remark, suggest
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.twin import Twin

@@ -5,9 +5,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.plausibility import check_extents, check_times
-from servobench.harness.run.request import RunRequest, find_robot, find_sensing
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.scenario import Scenario, TaskSetting
 from servobench.harness.run.tasks import TASKS
@@ -15,6 +16,7 @@ from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.seeds import named_seed
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.mismatch import MismatchSample, sample_mismatch
 

@@ -17,7 +17,6 @@ import numpy as np
 from servobench.harness.config.entries import Kind, check_settings, summary_of
 from servobench.harness.config.registry import Registry
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
-from servobench.harness.run.request import DEFAULT_ROBOT
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
 from servobench.plant.cameras.setups import SetupModel
@@ -35,6 +34,7 @@ from servobench.plant.contract.settings import (
     remark,
     settings,
 )
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER

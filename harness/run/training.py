@@ -5,10 +5,11 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
-from servobench.harness.run.request import RunRequest, find_robot
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch
 
 

@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import accessing, divisions, is_file, read_toml, user_path
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
@@ -24,6 +25,7 @@ from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.twin import read_twin
+from servobench.plant.robot.ur5 import UR5
 from servobench.plant.robot.urdf_elements import RUN_XACRO
 from servobench.plant.robot.workspace import search_workspace, with_ball
 
@@ -31,11 +33,13 @@ ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
     title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
 } | {"panda": panda}
 """The arms by their makers' tables; each is made once."""
+DEFAULT_ROBOT: Final = UR5
 WITH: Final = " with "  # between a robot and the file of its camera
 # The suffixes of files of robots, and one that is refused
 SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf", ".xacro")
 
 
+@configuration_errors()
 def find_robot(text: str) -> Robot:
     """Return the robot that a name or the path of a file stands for; the same object for the same unchanged file.
 
@@ -45,7 +49,7 @@ def find_robot(text: str) -> Robot:
             the ball; each also with the file of a camera.
 
     Raises:
-        ValueError: an unknown name, or a file that cannot be used.
+        ConfigurationError: an unknown name, or a file that cannot be used.
     """
     word = read_word(text)
     if word.camera:
@@ -141,6 +145,27 @@ def with_files(
     if camera:
         changed += f"{WITH}{change(camera)}"
     return changed
+
+
+def with_camera(robot: str, camera: Path) -> str:
+    """Return the word for a robot with the camera of a file in place of the bench's.
+
+    Raises:
+        ConfigurationError: a robot or a file that cannot be used.
+    """
+    for path in (camera, camera.absolute()):  # a file may be called "ur5 with my_camera.toml"
+        word = f"{robot}{WITH}{path}"
+        if read_word(word).camera == str(path):
+            find_robot(word)
+            return word
+    raise ConfigurationError(
+        f"{word!r} is also the name of a file; give robot or camera another name"
+    )
+
+
+def short_name(robot: str) -> str:
+    """Return the word for a robot, and for its camera, without the folders of files."""
+    return with_files(robot, lambda file: PurePath(file).name)
 
 
 @cache

@@ -30,6 +30,7 @@ from typing import Final, Self
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import words_between
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import ANGLE, LENGTH, SENSOR_AXES, SHARE, sensor_settings
@@ -85,6 +86,7 @@ class Mismatch:
         _ = self.plant_settings
 
     @classmethod
+    @configuration_errors()
     def parse(cls, text: str) -> Self:
         """Return the mismatch that `text` describes.
 
@@ -92,8 +94,12 @@ class Mismatch:
             text: profiles and axes joined by `+`, see the module's docstring.
 
         Raises:
-            ValueError: an unknown word, a missing or malformed magnitude, or one out of its bounds.
+            ConfigurationError: no text, an unknown word, a missing or malformed magnitude, or one out of its bounds.
         """
+        if not isinstance(text, str):
+            raise ConfigurationError(
+                f"mismatch must be a text such as 'moderate' or 'links=10%', got {text!r}"
+            )
         profile = ""
         calibration = None
         axes = []

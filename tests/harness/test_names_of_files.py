@@ -11,11 +11,17 @@ from servobench.harness.apps.studies.challenge import FOLDER, find_challenge
 from servobench.harness.batch import results
 from servobench.harness.batch.logs import logged_in_file
 from servobench.harness.config.registry import choose_controller, choose_plant, is_foreign_plant
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import read_settings
-from servobench.harness.run.request import find_robot, find_sensing, short_name, with_camera
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import split_words
-from servobench.plant.robot.catalogue import RobotWord, read_word
+from servobench.plant.robot.catalogue import (
+    RobotWord,
+    find_robot,
+    read_word,
+    short_name,
+    with_camera,
+)
 from servobench.plant.robot.mismatch import Mismatch
 
 EYE = "width = 640\nheight = 480\nvertical_fov = 60.0\n"

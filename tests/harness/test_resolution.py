@@ -13,8 +13,9 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.settings import Settings, read_settings
 from servobench.harness.run.experiment import build
-from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import resolve
+from servobench.harness.run.variations import varied_in_row
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch

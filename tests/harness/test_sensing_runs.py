@@ -12,13 +12,14 @@ from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
 from servobench.harness.batch.manifest import describe_sensing
 from servobench.harness.config.registry import find_plant
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.outcome import pose_error
-from servobench.harness.run.request import RunRequest, find_sensing
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.harness.run.training import train_networks

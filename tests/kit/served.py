@@ -12,9 +12,10 @@ from contextlib import contextmanager
 from servobench.harness.apps.serve.server import PORTS, Server
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.loop import careful
-from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.request import RunRequest
+from servobench.plant.robot.mismatch import Mismatch
 
-REQUEST = RunRequest("kinematic", "constant", "target", read_mismatch("moderate"), 0, robot="ur5e")
+REQUEST = RunRequest("kinematic", "constant", "target", Mismatch.parse("moderate"), 0, robot="ur5e")
 # of speedJ, speedStop and moveJ, as ur-rtde has them
 SPEED = ("input_int_register_0", *(f"input_double_register_{k}" for k in range(8)))
 _numbers = itertools.count()

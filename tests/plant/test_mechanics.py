@@ -8,7 +8,7 @@ from scipy.signal import lsim
 
 from kit.plants import configure, mismatched
 from servobench.harness.config.registry import find_plant
-from servobench.harness.run.request import find_sensing
+from servobench.harness.config.sensing import find_sensing
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot

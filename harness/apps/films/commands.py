@@ -139,8 +139,9 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import read_settings
     from servobench.harness.run.episode import run_experiment
-    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import check_settings
+    from servobench.plant.robot.mismatch import Mismatch
 
     given = {name: value for name, value in vars(new).items() if value not in (None, [])}
     if folder is not None:
@@ -159,7 +160,7 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     }
     settings = read_settings(new.config, new.set_ or [])
     chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
-    request = RunRequest(**names | chosen | {"mismatch": read_mismatch(names["mismatch"])})
+    request = RunRequest(**names | chosen | {"mismatch": Mismatch.parse(names["mismatch"])})
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     return logged_run(result.row, result.steps)

@@ -31,10 +31,10 @@ from servobench.harness.pictures.style import (
     plain_logarithms,
     save_figure,
 )
-from servobench.harness.run.request import DEFAULT_ROBOT, short_name
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.rendered.detection import ByteArray
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, short_name
 from servobench.plant.robot.workspace import BALL_RADIUS
 
 MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")

@@ -17,7 +17,7 @@ import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant
 from servobench.harness.pictures.tracks import Track, track_of, values_drawn
-from servobench.harness.run.request import DEFAULT_ROBOT, OWN_ROBOT, find_robot
+from servobench.harness.run.request import OWN_ROBOT
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -26,6 +26,7 @@ from servobench.plant.contract.settings import remark
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Overview, Room
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import Robot

@@ -52,13 +52,14 @@ class Export:
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
-        from servobench.harness.run.request import RunRequest, read_mismatch
+        from servobench.harness.run.request import RunRequest
         from servobench.harness.run.resolution import check_settings
+        from servobench.plant.robot.mismatch import Mismatch
 
         names = "kinematic", selection.choose("controllers", controller), "target"
         check_settings(settings, names)
         return RunRequest(
-            *names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing
+            *names, Mismatch.parse(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing
         )
 
 

@@ -33,7 +33,7 @@ from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.loop import LoopSettings, begin, periods
-from servobench.harness.run.request import RunRequest, find_robot
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections, select
 from servobench.harness.run.sampling import draw, draw_robot
 from servobench.plant.bench.plant import PlantSetup
@@ -42,6 +42,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.catalogue import find_robot
 
 REFERENCE_PERIODS: Final = 200  # most periods of the run inside the FMU
 TOLERANCE: Final = 1e-9

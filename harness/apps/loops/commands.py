@@ -94,12 +94,13 @@ def _resolved(
 ) -> list[ResolvedRun]:
     """Return a run for each controller on the kinematic plant."""
     from servobench.harness.apps.loops.equilibrium import PLANT, TASK
-    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import check_settings, resolve
+    from servobench.plant.robot.mismatch import Mismatch
 
     names = selection.split("controllers", ",".join(controllers), robot=robot)
     check_settings(settings, [PLANT, TASK, *names])
-    drawn = read_mismatch(mismatch)
+    drawn = Mismatch.parse(mismatch)
     return [
         resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names
     ]

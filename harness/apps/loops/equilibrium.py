@@ -27,7 +27,6 @@ from servobench.harness.apps.loops.systems import ArmModel, StateSpace
 from servobench.harness.config.settings import flatten
 from servobench.harness.run.experiment import build
 from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
-from servobench.harness.run.request import find_robot
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray
@@ -37,6 +36,7 @@ from servobench.plant.contract.sensing import without_disturbance
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command, Observation, trusted_observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 Source: TypeAlias = Literal["true", "nominal", "estimated"]

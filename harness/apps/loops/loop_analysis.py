@@ -45,7 +45,7 @@ from servobench.harness.apps.loops.systems import (
     sensitivity,
 )
 from servobench.harness.run.loop import LoopSettings, Rollout, periods
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, find_robot
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.tasks import fitted
 from servobench.plant.bench.plant import Plant
@@ -54,6 +54,7 @@ from servobench.plant.contract.faults import ControllerDiverged, RunFault
 from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.signals import Command, Observation, Truth
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.mismatch import Mismatch
 
 AnyConfig: TypeAlias = Any  # settings of any composed controller

@@ -42,10 +42,11 @@ from servobench.harness.pictures.tracks import (
 )
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
-from servobench.harness.run.request import DEFAULT_ROBOT, varied_columns
+from servobench.harness.run.variations import varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import accessing, write_atomically
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"

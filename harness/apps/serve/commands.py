@@ -35,13 +35,14 @@ def serve(
 
     from servobench.harness.apps.serve import server
     from servobench.harness.run.loop import careful
-    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.request import RunRequest
     from servobench.harness.run.tasks import choose_task
+    from servobench.plant.robot.mismatch import Mismatch
 
     with configuration_errors("--address: "):
         ipaddress.ip_address(address)
     names = selection.choose("plants", plant), "constant", choose_task(task)
-    request = RunRequest(*names, read_mismatch(mismatch), seed, robot=robot, sensing=sensing)
+    request = RunRequest(*names, Mismatch.parse(mismatch), seed, robot=robot, sensing=sensing)
 
     with careful():
         try:

@@ -31,7 +31,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.loop import Rollout
-from servobench.harness.run.request import RunRequest, find_robot
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import check_settings, resolve
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.faults import ConfigurationError, RunFault
@@ -39,6 +39,7 @@ from servobench.plant.contract.files import reason
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
+from servobench.plant.robot.catalogue import find_robot
 
 Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
 # All but the last are UR's

@@ -28,10 +28,11 @@ from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.config.source import find_place
-from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, with_camera
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.sampling import draw
 from servobench.harness.run.tasks import choose_task
+from servobench.harness.run.variations import SHORT_NAMES
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.contract.settings import (
@@ -45,6 +46,7 @@ from servobench.plant.contract.settings import (
     settings,
     suggest,
 )
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, with_camera
 
 GRADES: Final = ("I", "II", "III")
 SUFFIX: Final = ".toml"

@@ -51,7 +51,7 @@ def robustness(
     from servobench.harness.apps.studies.robustness import BASE, TASK, find_lines, make_map
     from servobench.harness.batch.plan import Batch, parse_seeds
     from servobench.harness.cli.progress import watching
-    from servobench.harness.run.request import find_robot
+    from servobench.plant.robot.catalogue import find_robot
 
     settings = overrides.settings()
     lines = find_lines(split_words(axes))

@@ -26,18 +26,14 @@ from servobench.harness.config.registry import RENDERED, find_controller, find_p
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures import style
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.run.request import (
-    DEFAULT_ROBOT,
-    RunRequest,
-    RunSettings,
-    Varied,
-    find_robot,
-)
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.variations import Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.settings import suggest
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"

@@ -42,14 +42,16 @@ from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.rehearsal import build_once
-from servobench.harness.run.request import RunRequest, RunSettings, Varied, read_mismatch
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.variations import Varied
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.files import accessing
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, Periods, settings
+from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
 MOVE: Final = "random"
@@ -199,7 +201,7 @@ def _runs_of(own: TuningSet) -> tuple[RunRequest, ...]:
             noise = ("noise", level["noise"][world])
             latency = ("latency", level["latency"][world])
             values = (*varied, *drive, noise, latency)
-            mismatch = read_mismatch(model + level["detector"][world])
+            mismatch = Mismatch.parse(model + level["detector"][world])
             runs.append(RunRequest(plant, "", task, mismatch, seed, values))
     return tuple(runs)
 

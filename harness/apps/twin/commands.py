@@ -102,8 +102,9 @@ def identify(
     from servobench.harness.apps.twin.preflight import mistakes
     from servobench.harness.apps.twin.twin_file import estimates, remarks, twin_text
     from servobench.harness.batch.logs import UnevenRows
+    from servobench.harness.config.sensing import find_sensing
     from servobench.harness.run.experiment import build
-    from servobench.harness.run.request import RunSettings, find_sensing
+    from servobench.harness.run.request import RunSettings
     from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
 
     try:

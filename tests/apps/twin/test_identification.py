@@ -37,7 +37,8 @@ from servobench.harness.apps.twin.twin_file import (
     sensor,
     twin_text,
 )
-from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
+from servobench.harness.config.sensing import find_sensing
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.sampling import draw_robot
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
@@ -45,6 +46,7 @@ from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.mismatch import Mismatch
 
 pytestmark = pytest.mark.usefixtures("few_fits")
 LATENCY, DELAY, LAG = 0.08, 0.03, 0.07
@@ -80,7 +82,7 @@ def identified(sensing="position", seed=SEED):
 
 def true_robot(seed=SEED):
     return draw_robot(
-        RunRequest("kinematic", "constant", "random", read_mismatch(MISMATCH), seed, robot=ROBOT)
+        RunRequest("kinematic", "constant", "random", Mismatch.parse(MISMATCH), seed, robot=ROBOT)
     )[0]
 
 
@@ -472,7 +474,7 @@ def test_a_twin_has_the_features_and_the_uncertainty_of_the_log(tmp_path):
         "twin.toml",
     )
     request = RunRequest(
-        "kinematic", "constant", "random", read_mismatch("none"), 0, robot=str(path)
+        "kinematic", "constant", "random", Mismatch.parse("none"), 0, robot=str(path)
     )
     mean = draw_robot(request)[0]
     q = log.joints[::20]
@@ -646,7 +648,7 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
     made = run(
         "docs/examples/excite.py", task="random", mismatch=words, seed=81000, settings=settings
     )
-    request = RunRequest("kinematic", "constant", "random", read_mismatch(words), 81000)
+    request = RunRequest("kinematic", "constant", "random", Mismatch.parse(words), 81000)
     model = find_robot("ur5").nominal
     text, robot = mistakes(read_log(logged()[0].spec, made.steps), model)
     wanted = draw_robot(request)[0].arm.joint_offset - model.arm.joint_offset
