@@ -4,27 +4,29 @@ An aid is a stage of the chain that can be left out; all of them are off by defa
 
 An aid is declared once, by the field of `AidsConfig` that switches it: name, type, default and help as for any setting,
 and in its type a `Switch` with the value that a best equipped method has and the values that tuning tries. The tables
-of methods, the study of the aids and the spaces of tuning are made from these declarations.
+of methods, the study of the aids and the spaces of tuning are made from these declarations. A number that has an effect
+with some aids alone says so in its type, too: `Only`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias, TypeVar, get_type_hints
+from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias
 
 from annotated_types import Le
 
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.settings import (
     Delay,
     Deviation,
     NonNegative,
     Positive,
     Share,
+    declared,
     settings,
 )
 
 Known: TypeAlias = Literal["ignored", "identified", "given"]
 """Whether a quantity is left out, identified from the motions of the run, or given by a number."""
-Mark = TypeVar("Mark")
 
 
 @dataclass(frozen=True)
@@ -73,26 +75,35 @@ class AidsConfig:
         Switch("redistribute", tuned=("scale", "clip", "redistribute")),
     ] = "scale"
     """Saturation: a command beyond the limits is scaled, clipped by joint, or redistributed to joints with room."""
-    longest_delay: Annotated[NonNegative, Le(1.0)] = 0.25
-    """[s] the longest delay that is considered; for an identified one."""
-    latency: Delay = 0.0
-    """[s] latency of the camera; for a given delay. A method that gets the truth gets the true one."""
-    command_delay: Delay = 0.05
-    """[s] until a command shows in the joints; for a given response, as the next one."""
-    lag: Delay = 0.05
+    longest_delay: Annotated[NonNegative, Le(1.0), Only(delay="identified")] = 0.25
+    """[s] the longest delay that is considered."""
+    latency: Annotated[Delay, Only(delay="given")] = 0.0
+    """[s] latency of the camera; a method that gets the truth gets the true one."""
+    command_delay: Annotated[Delay, Only(response="given")] = 0.05
+    """[s] until a command shows in the joints."""
+    lag: Annotated[Delay, Only(response="given")] = 0.05
     """[s] time constant of the joints."""
-    response_length: Annotated[Positive, Le(2.0)] = 0.6
-    """[s] within which joints respond to a command; for an identified response."""
-    feature_noise: Deviation = 0.001
+    response_length: Annotated[Positive, Le(2.0), Only(response="identified")] = 0.6
+    """[s] within which joints respond to a command."""
+    feature_noise: Annotated[
+        Deviation,
+        Only(
+            delay=("identified", "given"),
+            response=("identified", "given"),
+            noise="identified",
+            filter=True,
+            model=("nominal", "regression"),
+        ),
+    ] = 0.001
     """[m] standard deviation of a feature, of pixels too; the first guess where it is identified."""
-    delay_margin: NonNegative = 6.0
+    delay_margin: Annotated[NonNegative, Only(delay="identified")] = 6.0
     """[1] by which a delay must be better than the present one, in −2 log likelihood."""
-    score_memory: Share = 1.0
+    score_memory: Annotated[Share, Only(delay="identified")] = 1.0
     """[1] share of a delay's score that is kept from one motion to the next; below 1 for a latency that changes."""
-    posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0, log=True)] = 0.6
-    """[1/s] gain of the null-space centring (`posture`)."""
-    damping: Positive = 0.02
-    """[m/rad] damping of the pseudo-inverse in feedforward, null-space centring and redistribution."""
+    posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0, log=True), Only(posture=True)] = 0.6
+    """[1/s] gain of the null-space centring."""
+    damping: Annotated[Positive, Only(feedforward=True, posture=True, limit="redistribute")] = 0.02
+    """[m/rad] damping of the aids' pseudo-inverse."""
 
     @property
     def needs_past(self) -> bool:
@@ -101,20 +112,9 @@ class AidsConfig:
         return away != ("ignored", "ignored", "given", False, "own")
 
 
-def _marked(mark: type[Mark]) -> dict[str, Mark]:
-    """Return the declarations of this type by setting, in the order of the settings."""
-    hints = get_type_hints(AidsConfig, include_extras=True)
-    marked = {}
-    for key, hint in hints.items():
-        for each in getattr(hint, "__metadata__", ()):
-            if isinstance(each, mark):
-                marked[key] = each
-    return marked
-
-
-SWITCHES: Final[Mapping[str, Switch]] = _marked(Switch)
+SWITCHES: Final[Mapping[str, Switch]] = declared(AidsConfig, Switch)
 """The aids by name."""
-RANGES: Final[Mapping[str, Tuned]] = _marked(Tuned)
+RANGES: Final[Mapping[str, Tuned]] = declared(AidsConfig, Tuned)
 """The numbers of the aids that are tuned, by name."""
 
 

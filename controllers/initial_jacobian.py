@@ -17,6 +17,7 @@ import numpy.typing as npt
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch, pick
 from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
@@ -36,16 +37,16 @@ class InitialConfig:
 
     source: Literal["nominal", "probe", "given"] = "nominal"
     """Where Ĵ₀ comes from: the nominal model, probing moves, or `given`."""
-    probe_step: Annotated[Positive, Usual(0.3)] = 0.03
+    probe_step: Annotated[Positive, Usual(0.3), Only(source="probe")] = 0.03
     """[rad] size of a probing move: some 20 mm at the ball, far above 1 mm of noise."""
-    probe_time: Annotated[Positive, Usual(1.0)] = 0.1
+    probe_time: Annotated[Positive, Usual(1.0), Only(source="probe")] = 0.1
     """[s] over which a probing move is spread."""
-    settle_time: Delay = 0.35
+    settle_time: Annotated[Delay, Only(source="probe")] = 0.35
     """[s] of rest before a feature counts."""
-    average_time: Annotated[Positive, Usual(2.0)] = 0.15
+    average_time: Annotated[Positive, Usual(2.0), Only(source="probe")] = 0.15
     """[s] of valid features that are averaged at each rest."""
-    given: tuple[tuple[Number, ...], ...] = ()
-    """[m/rad] m rows of n entries; only for source "given"."""
+    given: Annotated[tuple[tuple[Number, ...], ...], Only(source="given")] = ()
+    """[m/rad] m rows of n entries."""
 
 
 class InitialJacobian(ABC, Generic[State]):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Any, Final, Literal, final
+from typing import Annotated, Any, Final, Literal, final
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, S
 from servobench.controllers.periods import check_preview, in_periods, sampled, whole_periods
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.settings import (
     Count,
     NonNegative,
@@ -52,7 +53,7 @@ class NmpcCalibratedConfig:
     """[1] Gauss-Newton steps per period at most; 1 is the real-time iteration."""
     image: bool = False
     """Feed the image back (offset-free control); without it the controller trusts encoders and model alone."""
-    image_window: Positive = 0.5
+    image_window: Annotated[Positive, Only(image=True)] = 0.5
     """[s] of frames over which the offset of the image from the model is estimated."""
     joint_acceleration_limit: PositiveOrInfinite = math.inf
     """[rad/s²] limit of the change between two commands; inf: none."""

@@ -30,13 +30,14 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Literal, NamedTuple, TypeAlias, final
+from typing import Annotated, Literal, NamedTuple, TypeAlias, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import outer, plus_diagonal
 from servobench.plant.contract.settings import (
@@ -228,11 +229,11 @@ def kalman_estimator(
 class UkfConfig(RandomWalk):
     """Settings of the unscented Kalman filter."""
 
-    alpha: Positive = 1.0
+    alpha: Annotated[Positive, Only(form="sigma_points")] = 1.0
     """[1] spread of the sigma points; 1 keeps all weights from being negative."""
-    beta: NonNegative = 2.0
+    beta: Annotated[NonNegative, Only(form="sigma_points")] = 2.0
     """[1] prior knowledge of the distribution; 2 suits a Gaussian."""
-    kappa: NonNegative = 0.0
+    kappa: Annotated[NonNegative, Only(form="sigma_points")] = 0.0
     """[1] secondary spread."""
     form: Literal["split", "sigma_points"] = "split"
     """Two computations of the same numbers; "sigma_points" is the reference, several times slower."""

@@ -19,6 +19,7 @@ from annotated_types import Le, Lt
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.lanes import branch, outer
 from servobench.plant.contract.settings import NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray
@@ -46,7 +47,7 @@ class CfdlConfig:
     """[rad] smaller motions are left out: 1 mm of noise hides them."""
     reset: bool = True
     """Return to Φ₀ when Φ loses its sign or vanishes."""
-    reset_norm: NonNegative = 1e-2
+    reset_norm: Annotated[NonNegative, Only(reset=True)] = 1e-2
     """[m/rad] ‖Φ‖ below which Φ counts as vanished."""
 
 

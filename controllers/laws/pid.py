@@ -12,14 +12,16 @@ the paper's error y − y_ref.
 """
 
 import math
-from typing import NamedTuple, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
+from annotated_types import Gt
 
 from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.settings import NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray, Observation
@@ -35,7 +37,7 @@ class PidConfig:
     """[1/s²] K_i; 0 as in the paper."""
     derivative_gain: NonNegative = 0.0
     """[1] K_d; 0 as in the paper."""
-    derivative_filter: NonNegative = 0.1
+    derivative_filter: Annotated[NonNegative, Only(derivative_gain=Gt(0.0))] = 0.1
     """[s] τ, time constant of the filtered derivative; two periods at 20 Hz."""
     damping: NonNegative = 0.02
     """[m/rad] δ, damping of the inverse; a tenth of the smallest singular value in a UR5's workspace."""

@@ -51,6 +51,8 @@ from servobench.harness.run.resolution import (
     select,
 )
 from servobench.harness.run.result import RunResult
+from servobench.harness.run.variations import ROLES
+from servobench.plant.contract.dependence import reasons_for_no_effect
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import writing_together
 from servobench.plant.contract.settings import remark
@@ -60,27 +62,6 @@ _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
 # Entries of a manifest that identify its runs
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
-NEEDED: Final = (  # settings, others that they need, and values of these that leave them idle
-    (("aids.latency",), {"aids.delay": ("ignored", "identified")}),
-    (("aids.longest_delay", "aids.delay_margin", "aids.score_memory"), {"aids.delay": ("ignored", "given")}),
-    (("aids.command_delay", "aids.lag"), {"aids.response": ("ignored", "identified")}),
-    (("aids.response_length",), {"aids.response": ("ignored", "given")}),
-    (("aids.posture_gain",), {"aids.posture": (False,)}),
-    (("aids.damping",), {"aids.feedforward": (False,), "aids.posture": (False,), "aids.limit": ("scale", "clip")}),
-    (("aids.feature_noise",), {"aids.delay": ("ignored",), "aids.response": ("ignored",), "aids.noise": ("given",),
-                               "aids.filter": (False,), "aids.model": ("own",)}),
-    (("estimator.reset_norm",), {"estimator.reset": (False,)}),
-    (("estimator.alpha", "estimator.beta", "estimator.kappa"), {"estimator.form": ("split",)}),
-    (("image_window",), {"image": (False,)}),
-    (("initial.given",), {"initial.source": ("nominal", "probe")}),
-    (("initial.probe_step", "initial.probe_time", "initial.settle_time", "initial.average_time"),
-     {"initial.source": ("nominal", "given")}),
-    (("law.derivative_filter",), {"law.derivative_gain": (0.0,)}),
-    (("mechanics.ripple_order",), {"mechanics.ripple": (0.0,)}),
-    (("mechanics.tool_damping",), {"mechanics.tool_frequency": (0.0,)}),
-    (("sensing.noise_offset",), {"sensing.noise": ("white", "stable", "uniform")}),
-    (("sensing.outlier_size",), {"sensing.outliers": (0.0,)}),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -408,22 +389,15 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
 def _remark_on_idle(settings: Settings, runs: Sequence[ResolvedRun]) -> None:
     """Remark on assignments to settings and variations that count only together with another setting."""
     for section, key, words in _given(settings, [run.request for run in runs]):
-        needed: Mapping[str, tuple[object, ...]] = next(
-            (others for keys, others in NEEDED if key in keys), {}
-        )
-        used = [
-            flatten(getattr(run, role))
+        idle = [
+            reasons_for_no_effect(getattr(run, role), key)
             for run in runs
-            for role in ("plant", "controller")
+            for role in ROLES
             if section == getattr(run.request, role)
             or (section == role and run.request.varies(f"{role}.{key}"))
         ]
-        if (
-            needed
-            and used
-            and all(each.get(name) in idle for each in used for name, idle in needed.items())
-        ):
-            found = " and ".join(f"{section}.{name} is {used[0][name]}" for name in needed)
+        if idle and all(idle):
+            found = " and ".join(f"{section}.{name} is {value}" for name, value in idle[0].items())
             remark(f"{words} has no effect while {found}")
 
 

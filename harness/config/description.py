@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-from servobench.plant.contract.settings import UNIT, field_strings
+from servobench.plant.contract.dependence import Only
+from servobench.plant.contract.settings import UNIT, declared, field_strings
 
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -42,12 +43,15 @@ def describe_settings(config: Any, prefix: str = "") -> Iterator[Setting]:  # no
     """Yield each setting of a configuration dataclass, those of nested sections with their name before theirs."""
     kind: Any = type(config)
     strings, hints = field_strings(kind), get_type_hints(kind, include_extras=True)
+    dependences = declared(kind, Only)
     for item in fields(config):
         value = getattr(config, item.name)
         if is_dataclass(value):
             yield from describe_settings(value, f"{prefix}{item.name}.")
         else:
             unit, meaning = UNIT.fullmatch(strings.get(item.name, "")).groups(default="")  # type: ignore[union-attr]
+            if meaning and item.name in dependences:
+                meaning = f"{meaning.rstrip('.')}. {dependences[item.name]}"
             yield Setting(prefix + item.name, value, unit, allowed(hints[item.name]), meaning)
 
 

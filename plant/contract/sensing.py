@@ -22,9 +22,10 @@ from functools import partial
 from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.settings import (
     Delay,
     Extent,
@@ -65,7 +66,7 @@ class SensingConfig:
     """[1] rows of a matrix L by which the noise is multiplied; empty for the identity."""
     noise_share: Share = 0.1
     """[1] ρ, share of the noise that is displaced, for "mixture" and "bimodal"."""
-    noise_offset: Extent = 0.02
+    noise_offset: Annotated[Extent, Only(noise=("mixture", "bimodal"))] = 0.02
     """[m or px] μ, by how much it is displaced."""
     noise_spread: Positive = 1.0
     """[1] κ, deviation of the displaced part of "mixture" over σ."""
@@ -77,7 +78,7 @@ class SensingConfig:
     """[m or px] the feature is rounded to multiples of it; 0: it is not."""
     outliers: ShareBelowOne = 0.0
     """[1] share of the frames that are outliers: the feature is seen elsewhere."""
-    outlier_size: Extent = 0.05
+    outlier_size: Annotated[Extent, Only(outliers=Gt(0.0))] = 0.05
     """[m or px] distance of an outlier, in a direction drawn at random."""
     outlier_duration: Delay = 0.0
     """[s] how long an outlier stays where it is; 0: one frame."""

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
+from annotated_types import Gt
 
 from servobench.plant.contract.checks import FloatArray, fewest_parts
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
@@ -42,11 +44,11 @@ class MechanicsConfig:
     """[rad] b: half of the play between each gear and its joint."""
     ripple: Annotated[NonNegative, Usual(0.2)] = 0.0
     """[rad] a: each gear leads by a sin(k q)."""
-    ripple_order: Positive = 8.0
+    ripple_order: Annotated[Positive, Only(ripple=Gt(0.0))] = 8.0
     """[1] k, periods of the ripple in a turn."""
     tool_frequency: NonNegative = 0.0
     """[rad/s] ω, natural frequency of a flexible tool; 0: rigid."""
-    tool_damping: ShareBelowOne = 0.02
+    tool_damping: Annotated[ShareBelowOne, Only(tool_frequency=Gt(0.0))] = 0.02
     """[1] ζ, its damping ratio."""
 
     def __post_init__(self) -> None:
