@@ -6,6 +6,7 @@ from annotated_types import Ge, Len, Lt
 
 from servobench.controllers.networks.rbf import STEP, Kernel
 from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.settings import (
     Count,
     NonNegative,
@@ -62,7 +63,7 @@ class ControllerTraining:
     """[1/s] K_p of the law that is imitated."""
     damping: NonNegative = 0.0
     """[m/rad] δ of the imitated law's inverse; 0: J⁺ without directions below a tenth of the strongest."""
-    posture_gain: NonNegative = 0.5
+    posture_gain: Annotated[NonNegative, Only(fit="output")] = 0.5
     """[1/s] K_n, towards the region's middle in the null space; 0 as in the paper."""
     fit: Literal["output", "entries"] = "output"
     """Target of the fit: the product ψ ξ, or the entries of ψ as the paper reads."""

@@ -31,6 +31,7 @@ from annotated_types import Gt, Le
 from servobench.harness.run.scenario import Scenario, Task, TaskSetting
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Positive, settings
 from servobench.plant.robot.camera import CAMERA
@@ -145,10 +146,12 @@ class PoseTask(Task):
 
     displacement: Literal["axis_turn", "retreat", "camera_turn", "plane_turn"] = "axis_turn"
     """which of the four canonical ones"""
-    angle: Annotated[float, Gt(0.0), Le(180.0)] = 45.0
-    """[deg] of a turn"""
-    nearer: Annotated[float, Gt(0.0), Le(0.8)] = 0.25
-    """[1] share of the distance by which the start is nearer, of a retreat"""
+    angle: Annotated[
+        float, Gt(0.0), Le(180.0), Only(displacement=("axis_turn", "camera_turn", "plane_turn"))
+    ] = 45.0
+    """[deg] by which the start is turned"""
+    nearer: Annotated[float, Gt(0.0), Le(0.8), Only(displacement="retreat")] = 0.25
+    """[1] share of the distance by which the start is nearer"""
     duration: Positive = 10.0
     """[s] length of the run"""
 

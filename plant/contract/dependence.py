@@ -50,7 +50,8 @@ def _condition(name: str, wanted: object) -> str:
     if isinstance(wanted, Gt):
         return f"{setting} above {wanted.gt:g}"
     if isinstance(wanted, tuple):
-        return f"{setting} {' or '.join(map(str, wanted))}"
+        *first, last = wanted
+        return f"{setting} {', '.join(first)} or {last}"
     return f"{setting} {wanted}"
 
 

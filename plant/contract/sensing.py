@@ -64,33 +64,34 @@ class SensingConfig:
     """Family of the noise of each component."""
     noise_shape: tuple[tuple[Number, ...], ...] = ()
     """[1] rows of a matrix L by which the noise is multiplied; empty for the identity."""
-    noise_share: Share = 0.1
-    """[1] ρ, share of the noise that is displaced, for "mixture" and "bimodal"."""
+    noise_share: Annotated[Share, Only(noise=("mixture", "bimodal"))] = 0.1
+    """[1] ρ, share of the noise that is displaced."""
     noise_offset: Annotated[Extent, Only(noise=("mixture", "bimodal"))] = 0.02
     """[m or px] μ, by how much it is displaced."""
-    noise_spread: Positive = 1.0
-    """[1] κ, deviation of the displaced part of "mixture" over σ."""
-    stability: Annotated[float, Ge(0.5), Le(2.0)] = 1.5  # below 0.5 the numbers tell nothing
-    """[1] α, exponent of the family "stable": 2 is white, 1 is Cauchy."""
-    skewness: Annotated[float, Ge(-1.0), Le(1.0)] = 0.0
-    """[1] β, skewness of the family "stable"."""
+    noise_spread: Annotated[Positive, Only(noise="mixture")] = 1.0
+    """[1] κ, deviation of the displaced part over σ."""
+    # Below 0.5 the numbers tell nothing.
+    stability: Annotated[float, Ge(0.5), Le(2.0), Only(noise="stable")] = 1.5
+    """[1] α, exponent of the family: 2 is white, 1 is Cauchy."""
+    skewness: Annotated[float, Ge(-1.0), Le(1.0), Only(noise="stable")] = 0.0
+    """[1] β, skewness of the family."""
     quantum: Extent = 0.0
     """[m or px] the feature is rounded to multiples of it; 0: it is not."""
     outliers: ShareBelowOne = 0.0
     """[1] share of the frames that are outliers: the feature is seen elsewhere."""
     outlier_size: Annotated[Extent, Only(outliers=Gt(0.0))] = 0.05
     """[m or px] distance of an outlier, in a direction drawn at random."""
-    outlier_duration: Delay = 0.0
+    outlier_duration: Annotated[Delay, Only(outliers=Gt(0.0))] = 0.0
     """[s] how long an outlier stays where it is; 0: one frame."""
     occlusions: ShareBelowOne = 0.0
     """[1] share of the frames in which the feature is hidden, at random times."""
-    occlusion_duration: Annotated[Positive, Usual(10.0)] = 0.5
+    occlusion_duration: Annotated[Positive, Usual(10.0), Only(occlusions=Gt(0.0))] = 0.5
     """[s] length of each of these occlusions."""
     occlusion_windows: tuple[tuple[Number, Number], ...] = ()
     """[s] further occlusions: begin (included, above 0) and end (excluded) of each."""
     latency_swing: Delay = 0.0
     """[s] A: a frame exposed at t is late by A (1 + sin(2π t/P)) in addition to the latency."""
-    swing_period: Annotated[Positive, Usual(100.0)] = 4.0
+    swing_period: Annotated[Positive, Usual(100.0), Only(latency_swing=Gt(0.0))] = 4.0
     """[s] P of this swing."""
     camera_turn: Annotated[NonNegative, Usual(3.2)] = 0.0
     """[rad/s] the first camera turns about its optical axis, from its pose at the start on."""

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Len
 
+from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import (
     Count,
@@ -41,22 +42,43 @@ class DriveConfig:
     """Settings of the joints' drives: lists have one number for all joints or one for each."""
 
     dynamics: bool = True
-    """Torque-driven joints; without it they follow the lag exactly, without mass, load and friction."""
-    velocity_bandwidth: tuple[Positive, ...] = (15.0, 15.0, 15.0, 20.0, 20.0, 20.0)
+    """Torque-driven joints; without it they follow the lag exactly."""
+    velocity_bandwidth: Annotated[tuple[Positive, ...], Only(dynamics=True)] = (
+        15.0,
+        15.0,
+        15.0,
+        20.0,
+        20.0,
+        20.0,
+    )
     """[Hz] of each velocity loop; in no data sheet: chosen so that joints rise in about 50 ms, as on `kinematic`."""
-    torque_limit: tuple[Positive, ...] = ur5.MAX_TORQUE
+    torque_limit: Annotated[tuple[Positive, ...], Only(dynamics=True)] = ur5.MAX_TORQUE
     """[Nm] of each joint, by its maker; these of Universal Robots, "Max. joint torques"."""
-    rotor_inertia: tuple[NonNegative, ...] = (0.1,)
+    rotor_inertia: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (0.1,)
     """[kg m²] of the rotor, times the gear's ratio squared; that of the UR5e in MuJoCo Menagerie, in no data sheet."""
-    coulomb_friction: tuple[NonNegative, ...] = (7.5, 7.5, 7.5, 1.4, 1.4, 1.4)
+    coulomb_friction: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (
+        7.5,
+        7.5,
+        7.5,
+        1.4,
+        1.4,
+        1.4,
+    )
     """[Nm] 5 % of the torque limit; an order of magnitude for strain-wave gears, in no data sheet."""
-    viscous_friction: tuple[NonNegative, ...] = (7.5, 7.5, 7.5, 1.4, 1.4, 1.4)
+    viscous_friction: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (
+        7.5,
+        7.5,
+        7.5,
+        1.4,
+        1.4,
+        1.4,
+    )
     """[Nm s/rad] at 1 rad/s as much as Coulomb friction; an order of magnitude, too."""
-    friction_compensation: Share = 0.8
+    friction_compensation: Annotated[Share, Only(dynamics=True)] = 0.8
     """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
-    payload: Load = 2.5
+    payload: Annotated[Load, Only(dynamics=True)] = 2.5
     """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and its load."""
-    assumed_payload: Load = 0.9
+    assumed_payload: Annotated[Load, Only(dynamics=True)] = 0.9
     """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
 
     def check(self, n: int) -> None:
@@ -129,13 +151,13 @@ class RenderedConfig:
     """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""
     depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"
     """Model of the depth noise."""
-    depth_subpixel: NonNegative = 0.08
+    depth_subpixel: Annotated[NonNegative, Only(depth_noise="stereo")] = 0.08
     """[px] RMS disparity error of a stereo match; vendor's white paper."""
-    depth_baseline: Positive = 0.05
+    depth_baseline: Annotated[Positive, Only(depth_noise="stereo")] = 0.05
     """[m] between the two imagers; RealSense D435."""
-    native_width: Count = 848
+    native_width: Annotated[Count, Only(depth_noise=("stereo", "structured_light"))] = 848
     """[px] width at which the depth sensor matches; optimum of the RealSense D435."""
-    depth_patch: NonNegative = 9.0
+    depth_patch: Annotated[NonNegative, Only(depth_noise=("stereo", "structured_light"))] = 9.0
     """[px] side of the matched patch at `native_width`, over which depths share their error; 0 means white noise."""
     depth_quantisation: NonNegative = 0.001
     """[m] depth unit of the sensor; 0 means none."""

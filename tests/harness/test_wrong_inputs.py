@@ -437,6 +437,8 @@ def test_a_task_as_it_comes_is_not_remarked_on(caplog, task, sensing):
          "noise_offset=0.05 has no effect while kinematic.sensing.noise is white"),
         ("kinematic.sensing.outlier_size=0.1", (), "has no effect while kinematic.sensing.outliers is 0.0"),
         ("kinematic.sensing.outlier_size=0.1", ("--mismatch", "outliers=20%"), ""),
+        ("kinematic.sensing.skewness=0.5", (), "has no effect while kinematic.sensing.noise is white"),
+        ("kinematic.sensing.skewness=0.5", ("--mismatch", "stable=1.5"), ""),
         ("constant.initial.given=[[1.0]]", (), "has no effect while constant.initial.source is nominal"),
         ("constant.initial.probe_step=0.1", (), "has no effect while constant.initial.source is nominal"),
         ("constant.aids.lag=0.1", (), "has no effect while constant.aids.response is ignored"),

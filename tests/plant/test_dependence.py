@@ -8,6 +8,7 @@ from annotated_types import Gt
 
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.config import registry
+from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.dependence import Only, reasons_for_no_effect
 from servobench.plant.contract.settings import NonNegative, check_field, declared, nested, settings
 
@@ -28,6 +29,7 @@ class Camera:
     filter: bool = False
     latency: Annotated[NonNegative, Only(delay="given")] = 0.0
     noise: Annotated[NonNegative, Only(delay=("identified", "given"), filter=True)] = 0.0
+    margin: Annotated[NonNegative, Only(delay=("ignored", "identified", "given"))] = 0.0
     tool: Tool = nested(Tool)
 
 
@@ -56,6 +58,9 @@ def test_a_declaration_is_a_sentence():
         str(declared(Camera, Only)["noise"])
         == "Only with `delay` identified or given, or `filter`."
     )
+    assert (
+        str(declared(Camera, Only)["margin"]) == "Only with `delay` ignored, identified or given."
+    )
     assert str(declared(Tool, Only)["damping"]) == "Only with `frequency` above 0."
 
 
@@ -76,13 +81,14 @@ def test_every_declaration_names_settings_beside_it_and_values_that_they_can_hav
     configs = [part.config() for part in (*ESTIMATORS.values(), *LAWS.values())]
     configs += [registry.find_controller(name).config() for name in registry.CONTROLLERS]
     configs += [registry.find_plant(name).config() for name in registry.PLANTS]
+    configs += [task.default for task in TASKS.values()]
     declarations = {
         (type(part), name, only)
         for config in configs
         for part in parts(config)
         for name, only in declared(type(part), Only).items()
     }
-    assert len(declarations) > 20
+    assert len(declarations) > 40
     for kind, name, only in declarations:
         for other, wanted in only.needed.items():
             values = wanted if isinstance(wanted, tuple) else (wanted,)
