@@ -14,14 +14,13 @@ from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias
 
 from annotated_types import Le
 
-from servobench.plant.contract.dependence import Only
+from servobench.plant.contract.dependence import Only, declared
 from servobench.plant.contract.settings import (
     Delay,
     Deviation,
     NonNegative,
     Positive,
     Share,
-    declared,
     settings,
 )
 

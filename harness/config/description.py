@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-from servobench.plant.contract.dependence import Only
-from servobench.plant.contract.settings import UNIT, declared, field_strings
+from servobench.plant.contract.dependence import Only, declared
+from servobench.plant.contract.settings import UNIT, field_strings
 
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 

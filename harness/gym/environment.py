@@ -187,7 +187,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self.resolved: Final = resolve(request, given)
         experiment = build(self.resolved)
         experiment.plant.close()  # `reset` builds one for each episode
-        check_possible(self.resolved, experiment)
+        check_possible(self.resolved, experiment.drawn, experiment.plant.spec)
         self._experiment: Experiment | None = None
         self._rollout: Rollout | None = None
         self._over = True

@@ -11,14 +11,13 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.config.sensing import sensing_file
-from servobench.harness.run.experiment import Experiment
 from servobench.harness.run.resolution import ResolvedRun
-from servobench.harness.run.sampling import checked_instants
+from servobench.harness.run.sampling import Drawn, checked_instants
 from servobench.harness.run.scenario import Scenario, Vector
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.catalogue import find_robot
@@ -35,16 +34,20 @@ MAX_PLACE: Final = 20.0  # [m] farthest target that is not remarked on
 RATES: Final = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}
 
 
-def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
+def check_possible(run: ResolvedRun, drawn: Drawn, spec: PlantSpec) -> None:
     """Refuse a start, or a target taught at joint positions, outside the joints' limits, and a target out of reach.
+
+    Args:
+        run: the run.
+        drawn: its true robot and its task; without a true robot nothing is refused.
+        spec: of its plant.
 
     Raises:
         ConfigurationError: names it and the joint, or how far it is out of reach of any true robot.
     """
-    if experiment.drawn.true is None:
+    if drawn.true is None:
         return
-    scenario = experiment.scenario
-    spec = experiment.plant.spec
+    scenario = drawn.scenario
     for what, values in (("start", scenario.start), ("target", run.task.taught_at)):
         if values is None:
             continue
@@ -58,16 +61,20 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     _check_reach(run, scenario, spec)
 
 
-def check_features(run: ResolvedRun, experiment: Experiment) -> None:
-    """Remark on a reference that is likely in mm or too fast for the arm, and on a user's features that hardly move."""
+def check_features(run: ResolvedRun, drawn: Drawn, spec: PlantSpec, desired: FloatArray) -> None:
+    """Remark on a reference that is likely in mm or too fast for the arm, and on a user's features that hardly move.
+
+    Args:
+        run: the run.
+        drawn: its true robot and its task.
+        spec: of its plant.
+        desired: (k, m) [unit of the feature], the desired features at the control instants.
+    """
     request = run.request
-    spec = experiment.plant.spec
     unit = spec.feature_unit
-    true = experiment.drawn.true
-    start = experiment.scenario.start
+    true = drawn.true
+    start = drawn.scenario.start
     task = f"the reference of the task {request.task}"
-    with configuration_errors(f"task {request.task}: "):
-        desired = experiment.desired()
     if true is None or start is None:
         size = np.abs(desired).max()
         if unit == "m" and size > MAX_PLACE:

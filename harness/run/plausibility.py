@@ -6,7 +6,6 @@ Settings that are valid one by one and make no run together are refused, such as
 from typing import Final
 
 from servobench.harness.run.request import RunSettings
-from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.sensing import SensingConfig
@@ -17,14 +16,23 @@ from servobench.plant.robot.hand_eye import RobotModel
 MAX_EXTENT: Final = 0.1  # [1]
 
 
-def check_times(resolved: ResolvedRun, duration: float) -> None:
-    """Refuse times that are longer than the run of `duration` [s], so that they never end in it."""
-    plant = resolved.request.plant
+def check_times(run: RunSettings, plant: str, config: object, duration: float) -> None:
+    """Refuse times that are longer than a run, so that they never end in it.
+
+    Args:
+        run: its section `run`.
+        plant: name of its plant.
+        config: settings of the plant.
+        duration: its length [s].
+
+    Raises:
+        ConfigurationError: names the first such time.
+    """
     whole = f"the run of {duration:g} s"
-    times = {"run.period": resolved.run.period}
+    times = {"run.period": run.period}
     for name in ("command_delay", "lag"):
-        times[f"{plant}.{name}"] = getattr(resolved.plant, name, 0.0)
-    sensing = getattr(resolved.plant, "sensing", None)
+        times[f"{plant}.{name}"] = getattr(config, name, 0.0)
+    sensing = getattr(config, "sensing", None)
     if isinstance(sensing, SensingConfig):
         for name in ("latency", "jitter", "frame_period", "latency_swing"):
             times[f"{plant}.sensing.{name}"] = getattr(sensing, name)
@@ -36,26 +44,34 @@ def check_times(resolved: ResolvedRun, duration: float) -> None:
         if isinstance(time, float) and time > 0.0 and time >= duration:
             meant = likely_meant(time, "s", lambda other: other < duration)
             raise ConfigurationError(f"{name} must be shorter than {whole}, got {time:g} s{meant}")
-    preview = resolved.run.preview_time
+    preview = run.preview_time
     if preview > max(duration, RunSettings().preview_time):
         raise ConfigurationError(
             f"run.preview_time must be no longer than {whole}, got {preview:g} s"
         )
 
 
-def check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
+def check_extents(plant: str, config: object, nominal: RobotModel | None) -> None:
     """Refuse noise, steps and outliers beyond an image, or a metre, and remark on those beyond a tenth of it.
 
     A plain number of a pixel's noise is one of metres and likely a mistake beyond a tenth.
+
+    Args:
+        plant: name of a plant.
+        config: settings of the plant.
+        nominal: the nominal robot with its cameras; None for a plant that brings its own.
+
+    Raises:
+        ConfigurationError: names the first such extent.
     """
-    sensing = getattr(resolved.plant, "sensing", None)
+    sensing = getattr(config, "sensing", None)
     if nominal is None or not isinstance(sensing, SensingConfig):
         return
     unit = nominal.channel.unit
     whole = 1.0
     if unit == "px" and isinstance(nominal, SetupModel):
         whole = nominal.optics.size[0]
-    with configuration_errors(f"{resolved.request.plant}."):
+    with configuration_errors(f"{plant}."):
         extents = sensing.extents(unit, nominal.noise_unit)
     if unit not in ("px", "m"):
         return
@@ -63,7 +79,7 @@ def check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
         size = nominal.noise_unit * metres
         if size <= (whole if name == "outlier_size" else MAX_EXTENT * whole):
             continue
-        place = f"{resolved.request.plant}.sensing.{name}"
+        place = f"{plant}.sensing.{name}"
         words = f"{place} is {size:.4g} {unit}, above a tenth of {whole:g} {unit}"
         given = getattr(sensing, name)
         plain = given == metres

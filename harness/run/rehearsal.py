@@ -25,15 +25,19 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     """
     try:
         experiment = build(run, progress=progress)
+        drawn = experiment.drawn
+        spec = experiment.plant.spec
         with contextlib.closing(experiment.plant) as plant:
-            check_features(run, experiment)
+            with configuration_errors(f"task {run.request.task}: "):
+                desired = experiment.desired()
+            check_features(run, drawn, spec, desired)
             if isinstance(plant, Bench):
                 plant.world.rehearse()
     except BaseException as error:
         if isinstance(error, ConfigurationError) or ends_batch(error):
             raise
         return  # The error is one of a plug-in; its run will fail in the same way.
-    check_possible(run, experiment)
+    check_possible(run, drawn, spec)
 
 
 def try_to_build(word: str, name: str, robot_name: str) -> None:

@@ -120,8 +120,9 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
                 "its scenario differs from one call to the next: ", Exception
             ):
                 _check_repeated(scenario, points, task.scenario(setting))
-    check_times(resolved, scenario.duration)
-    check_extents(resolved, setting.nominal)
+    plant = resolved.request.plant
+    check_times(resolved.run, plant, resolved.plant, scenario.duration)
+    check_extents(plant, resolved.plant, setting.nominal)
     return scenario
 
 

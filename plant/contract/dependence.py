@@ -12,12 +12,13 @@
 Remarks on a setting without effect and the last sentence of its meaning on the pages are made from the declaration.
 """
 
-from operator import attrgetter
-from typing import Any, final
+from dataclasses import is_dataclass
+from functools import cache
+from typing import Any, TypeVar, final, get_type_hints
 
 from annotated_types import Gt
 
-from servobench.plant.contract.settings import declared
+Mark = TypeVar("Mark")
 
 
 @final
@@ -64,6 +65,24 @@ def _fits(value: Any, wanted: object) -> bool:  # noqa: ANN401 - any setting
     return bool(value == wanted)
 
 
+@cache
+def declared(kind: type, mark: type[Mark]) -> dict[str, Mark]:
+    """Return the declarations of a type in the annotations of a settings class, by field in their order.
+
+    Args:
+        kind: the class; one that is no dataclass has none.
+        mark: the type of the declarations, such as `Only`.
+    """
+    if not is_dataclass(kind):
+        return {}
+    found = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        for each in getattr(hint, "__metadata__", ()):
+            if isinstance(each, mark):
+                found[name] = each
+    return found
+
+
 def reasons_for_no_effect(config: object, key: str) -> dict[str, object]:
     """Return the settings that leave another without effect, with their values by dotted key; none if it has an effect.
 
@@ -71,12 +90,14 @@ def reasons_for_no_effect(config: object, key: str) -> dict[str, object]:
         config: the settings of a section, those of its parts nested.
         key: dotted key of a setting among them.
     """
-    part, dot, name = key.rpartition(".")
+    *parts, name = key.split(".")
     beside: Any = config
-    if part:
-        beside = attrgetter(part)(config)
+    for part in parts:
+        # The key may go on within a setting, such as a table of a user's.
+        beside = getattr(beside, part, None)
     kind: Any = type(beside)
     only = declared(kind, Only).get(name)
     if only is None or only.holds(beside):
         return {}
-    return {f"{part}{dot}{other}": getattr(beside, other) for other in only.needed}
+    section = key.removesuffix(name)
+    return {f"{section}{other}": getattr(beside, other) for other in only.needed}

@@ -161,7 +161,6 @@ File: TypeAlias = Annotated[
 
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
-Mark = TypeVar("Mark")
 
 REMARKS: Final[list[str]] = []  # remarks that this worker process keeps for its parent
 MAX_LISTED = 40  # number of names in an error message
@@ -328,24 +327,6 @@ def _checks(kind: type) -> dict[str, Check]:
         if not is_dataclass(hint):
             checks[item.name] = Check.of(hint)
     return checks
-
-
-@cache
-def declared(kind: type, mark: type[Mark]) -> dict[str, Mark]:
-    """Return the declarations of a type in the annotations of a settings class, by field in their order.
-
-    Args:
-        kind: the class; one that is no dataclass has none.
-        mark: the type of the declarations, such as `Usual`.
-    """
-    if not is_dataclass(kind):
-        return {}
-    found = {}
-    for name, hint in get_type_hints(kind, include_extras=True).items():
-        for each in getattr(hint, "__metadata__", ()):
-            if isinstance(each, mark):
-                found[name] = each
-    return found
 
 
 @cache

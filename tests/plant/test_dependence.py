@@ -9,8 +9,8 @@ from annotated_types import Gt
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.run.tasks import TASKS
-from servobench.plant.contract.dependence import Only, reasons_for_no_effect
-from servobench.plant.contract.settings import NonNegative, check_field, declared, nested, settings
+from servobench.plant.contract.dependence import Only, declared, reasons_for_no_effect
+from servobench.plant.contract.settings import NonNegative, check_field, nested, settings
 
 
 @settings
@@ -44,6 +44,7 @@ class Camera:
         (Camera(filter=True), "noise", {}),
         (Camera(), "delay", {}),
         (Camera(), "tool", {}),
+        (Camera(), "tool.size.width", {}),
         (Camera(), "tool.damping", {"tool.frequency": 0.0}),
         (Camera(tool=Tool(5.0)), "tool.damping", {}),
     ],

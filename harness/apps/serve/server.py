@@ -109,7 +109,7 @@ class Server:
                 resolved = replace(resolved, plant=plant)
             resolved = replace(resolved, run=replace(resolved.run, period=1.0 / RATE))
         experiment = build(resolved)
-        check_possible(resolved, experiment)
+        check_possible(resolved, experiment.drawn, experiment.plant.spec)
         self._plant, self._spec = experiment.plant, experiment.plant.spec
         first = self._plant.reset(named_seed(request.seed, "plant"))
         self.rollout = Rollout(self._plant, first, experiment.desired(), experiment.loop)
