@@ -113,9 +113,7 @@ class RunRequest:
                     value = in_own_unit(*parts, "s" if short.unit else "1")
             if isinstance(value, int | float):
                 by_role[short.key] = float(value)
-        return tuple(
-            sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0]))
-        )
+        return tuple(sorted(by_role.items(), key=_rank))
 
     def _by_role(self, key: str) -> str:
         """Return a setting's key with the role of its section in place of a plant's, controller's or task's name."""
@@ -160,14 +158,30 @@ class RunRequest:
         A varied setting is a column: that of its short name, or its key.
         """
         varied = dict(self.varied)
-        short = {each.column: varied.pop(each.key, each.usual) for each in SHORT_NAMES.values()}
-        names = {name: getattr(self, name) for name in ("run_id", "plant", "controller", "task")}
-        names |= {"mismatch": str(self.mismatch), "seed": self.seed, **short}
-        others = {
-            key: json.dumps(value) if isinstance(value, tuple) else value
-            for key, value in varied.items()
+        short = {}
+        for each in SHORT_NAMES.values():
+            short[each.column] = varied.pop(each.key, each.usual)
+        others = {}
+        for key, value in varied.items():
+            others[key] = json.dumps(value) if isinstance(value, tuple) else value
+        return {
+            "run_id": self.run_id,
+            "plant": self.plant,
+            "controller": self.controller,
+            "task": self.task,
+            "mismatch": str(self.mismatch),
+            "seed": self.seed,
+            **short,
+            "robot": self.robot,
+            "sensing": self.sensing,
+            **others,
         }
-        return {**names, "robot": self.robot, "sensing": self.sensing, **others}
+
+
+def _rank(varied: tuple[str, Value]) -> tuple[int, str]:
+    """Return the rank of a varied setting: those with short names first, then by key."""
+    key, _ = varied
+    return ORDER.get(key, len(ORDER)), key
 
 
 def read_seed(seed: Any) -> int:  # noqa: ANN401 - as a user gave it
