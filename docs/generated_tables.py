@@ -11,6 +11,7 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
     <!-- table: challenges:severe,wide -->
+    <!-- table: claims_summary:@1,2,4 -->
     <!-- stored: dynamics,dynamics_circle -->
     <!-- studies: docs/page_studies -->
     <!-- methods: table -->
@@ -24,8 +25,8 @@ A generated part of a page is everything between two comments, of which the firs
 The meaning of a setting is the string below its field, the default that of the class, with the other choices behind it.
 Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
-in which they differ. A measured table is one of docs/tables, or some of its rows by their first cell. `make results`
-writes it; until it exists the part stays as it is. `stored` links to measured tables of a study instead. `attributes`
+in which they differ. A measured table is one of docs/tables, or some of its rows by their first cell, or some of its
+columns by number. `make results` writes it; until it exists the part stays as it is. `stored` links to measured tables of a study instead. `attributes`
 and `interface` print docstrings and signatures. `install` shows how to install servobench with extras: once a release
 is on a package index, set `RELEASED` and call `make tables`.
 """
@@ -232,7 +233,8 @@ def measured(part: re.Match[str], folder: Path) -> str:
         part: of the page, which names the tables.
         folder: of the page, from which its links go.
     """
-    named, _, chosen = part[3].partition(":")
+    named, _, selected = part[3].partition(":")
+    chosen, _, columns = selected.partition("@")
     paths = [stored_tables.FOLDER / f"{name}.csv" for name in named.split(",")]
     if not all(path.exists() for path in paths):
         return part[4].strip("\n")
@@ -245,6 +247,8 @@ def measured(part: re.Match[str], folder: Path) -> str:
     if chosen:
         wanted = [f"`{row}`" for row in chosen.split(",")]
         rows = rows.set_index(rows.columns[0], drop=False).loc[wanted]
+    if columns:
+        rows = rows.iloc[:, [int(number) - 1 for number in columns.split(",")]]
     return f"{table(tuple(rows), rows.itertuples(index=False))}\n\n{origin}; [commands]({links[named]})"
 
 
@@ -398,15 +402,10 @@ def in_brief(method: Any) -> str:  # noqa: ANN401 - a function
 def metrics_table() -> str:
     """Return the table of the metrics of a run."""
     rows = [
-        (
-            f"`{metric.column}`",
-            metric.unit or "that of the feature",
-            metric.better or "–",
-            metric.meaning,
-        )
+        (f"`{metric.column}`", metric.unit or "feature's", metric.meaning)
         for metric in METRICS.values()
     ]
-    return table(("column", "unit", "better", "definition"), rows)
+    return table(("column", "unit", "definition"), rows)
 
 
 def variables_table() -> str:
