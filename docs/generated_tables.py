@@ -401,11 +401,8 @@ def in_brief(method: Any) -> str:  # noqa: ANN401 - a function
 
 def metrics_table() -> str:
     """Return the table of the metrics of a run."""
-    rows = [
-        (f"`{metric.column}`", metric.unit or "feature's", metric.meaning)
-        for metric in METRICS.values()
-    ]
-    return table(("column", "unit", "definition"), rows)
+    rows = [(f"`{metric.column}`", metric.meaning) for metric in METRICS.values()]
+    return table(("column", "definition"), rows)
 
 
 def variables_table() -> str:

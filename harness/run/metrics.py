@@ -276,7 +276,7 @@ _ALL: Final = (
     ),
     Metric(
         "rms_error", "", "RMS error of the run", 2,
-        "root of the mean of e² over all rows",
+        "root mean square of e over all rows",
         lambda run: _rms(run, run.error),
     ),
     Metric(
@@ -286,13 +286,13 @@ _ALL: Final = (
     ),
     Metric(
         "rms_error_second_lap", "", "RMS error of the second lap", 2,
-        "the same as `rms_error` over the second lap, the first one after the entry; NaN where nothing is repeated",
+        "the same over the second lap, the first one after the entry; NaN where nothing is repeated",
         lambda run: _rms(run, run.second_lap),
         tables={"curves": "RMS error"}, summary=Summary(1, "curve"),
     ),
     Metric(
         "rms_error_evaluated", "", "RMS error of the judged part", 2,
-        "root of the mean of e² over the judged part of the [task](tasks.md); NaN if the run ended before it",
+        "the same over the judged part of the [task](tasks.md); NaN if the run ended before it",
         lambda run: _rms(run, run.evaluated),
         tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary(1, "curve"),
     ),
@@ -303,13 +303,12 @@ _ALL: Final = (
     ),
     Metric(
         "path_length_ratio", "1", "path ratio", 3,
-        "length of the true path over the distance from the start to the target, or over the length of the reference's "
-        "path if that moves",
+        "length of the true path over the distance from start to target, or over the path of a moving reference",
         _path_length_ratio, tables={"moves": "Motion"},
     ),
     Metric(
         "max_joint_position_rad", "rad", "largest joint position", 2,
-        "largest |q| of all joints and rows, as the encoders report it",
+        "largest |q| that the encoders report",
         lambda run: np.abs(_columns(run.steps.joint_position)).max(axis=(-2, -1)),
         better="", tables={"curves": "Motion"}, summary=Summary(2, "curve"),
     ),
@@ -321,14 +320,13 @@ _ALL: Final = (
     ),
     Metric(
         "saturation_fraction", "1", "saturated periods", 1,
-        "share of rows in which at least one joint is commanded at its speed limit",
+        "share of rows that command a joint at its speed limit",
         _saturation, percent=True, tables={"cost": "Joints"}, figure="effort",
     ),
     Metric(
         "joint_acceleration_peak_rad_s2", "rad/s²", "peak acceleration", 1,
-        "largest |a| of all joints and rows, a_k = (u_k − u_(k−1)) / dt of consecutive commands; the step from rest to "
-        "the first command does not count; NaN for a single row. A step of the command has a = Δu / dt, so compare "
-        "only runs of equal periods",
+        "largest |a|, a_k = (u_k − u_(k−1)) / dt of consecutive commands (not the first one, from rest); NaN for a single "
+        "row. Compare only runs of equal periods",
         lambda run: _peak(run, run.acceleration),
     ),
     Metric(
@@ -350,8 +348,8 @@ _ALL: Final = (
     ),
     Metric(
         "command_switches", "1", "sign switches", 0,
-        "how often joints are driven back and forth: periods whose command is at least 10 % of the joint's speed limit "
-        "and whose last command of that size, one or two periods before, had the other sign; sum over joints",
+        "periods in which a joint's command, of at least 10 % of its speed limit, has the opposite sign of the last such "
+        "command one or two periods before; sum over joints",
         lambda run: sign_switches(run.command, run.steps.spec.joint_velocity_limit).astype(np.float64),
         tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary(0),
     ),
@@ -373,8 +371,7 @@ _ALL: Final = (
     ),
     Metric(
         "controller_time_median_us", "µs", "step, median", 0,
-        "median of `controller_time_us`; this and the next three are null where runs [advanced "
-        "together](experiments.md)",
+        "median of `controller_time_us`; times are null where runs [advanced together](experiments.md#sweeps)",
         lambda run: run.same(float(np.median(run.steps.controller_time))),
         tables={"cost": "Step of the controller"}, summary=Summary(0),
     ),
@@ -386,7 +383,7 @@ _ALL: Final = (
     ),
     Metric(
         "controller_time_overruns", "1", "steps over the period", 0,
-        "rows whose `controller_time_us` is longer than the period",
+        "rows in which it exceeds the period",
         _overruns, tables={"cost": "Step of the controller"},
     ),
     Metric(
@@ -396,13 +393,12 @@ _ALL: Final = (
     ),
     Metric(
         "pose_error_mm", "mm", "pose error of the last second", 1,
-        "mean distance of the target from its taught position over the last second; a column only of sensing set-ups "
-        "that are judged by the pose of a target",
+        "mean distance of the target from its taught position over the last second; only where sensing judges the pose",
         tables={"moves": "Error"},
     ),
     Metric(
         "pose_error_deg", "deg", "angle error of the last second", 2,
-        "mean rotation of the target from its taught orientation over the last second; likewise",
+        "likewise its mean rotation",
         tables={"moves": "Error"},
     ),
 )  # fmt: skip
