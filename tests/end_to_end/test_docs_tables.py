@@ -226,11 +226,7 @@ def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
 
 
 def test_the_keys_of_a_mapping_are_those_of_the_code():
-    rows = next(
-        rows
-        for _, header, rows in tables(read("fmu.md"))
-        if header[0] == "key"
-    )
+    rows = next(rows for _, header, rows in tables(read("fmu.md")) if header[0] == "key")
     mapping = FmuMapping(Path("crane.fmu"), ("push",), ("place",))
     wanted = set()
     for key in vars(mapping).keys() - {"parameters", "nominal"}:
