@@ -26,7 +26,8 @@ The meaning of a setting is the string below its field, the default that of the 
 Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
 in which they differ. A measured table is one of docs/tables, or some of its rows by their first cell, or some of its
-columns by number. `make results` writes it; until it exists the part stays as it is. `stored` links to measured tables of a study instead. `attributes`
+columns by number. `make results` writes it; until it exists the part stays as it is.
+`stored` links to measured tables of a study instead. `attributes`
 and `interface` print docstrings and signatures. `install` shows how to install servobench with extras: once a release
 is on a package index, set `RELEASED` and call `make tables`.
 """

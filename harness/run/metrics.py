@@ -325,8 +325,8 @@ _ALL: Final = (
     ),
     Metric(
         "joint_acceleration_peak_rad_s2", "rad/s²", "peak acceleration", 1,
-        "largest |a|, a_k = (u_k − u_(k−1)) / dt of consecutive commands (not the first one, from rest); NaN for a single "
-        "row. Compare only runs of equal periods",
+        "largest |a|, a_k = (u_k − u_(k−1)) / dt of consecutive commands (not the first one, from rest); NaN for a "
+        "single row. Compare only runs of equal periods",
         lambda run: _peak(run, run.acceleration),
     ),
     Metric(
@@ -348,8 +348,8 @@ _ALL: Final = (
     ),
     Metric(
         "command_switches", "1", "sign switches", 0,
-        "periods in which a joint's command, of at least 10 % of its speed limit, has the opposite sign of the last such "
-        "command one or two periods before; sum over joints",
+        "periods in which a joint's command, of at least 10 % of its speed limit, has the opposite sign of the last "
+        "such command one or two periods before; sum over joints",
         lambda run: sign_switches(run.command, run.steps.spec.joint_velocity_limit).astype(np.float64),
         tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary(0),
     ),
