@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from servobench.plant.fmu.dialect import DIALECTS
+
 # No fused multiply-add, so that every platform rounds alike; only the FMI functions are visible.
 CODE = ("-std=c11", "-O3", "-ffp-contract=off", "-fvisibility=hidden", "-shared")
 COMPILERS = ("cc", "gcc", "clang")
@@ -30,15 +32,15 @@ class Platform:
     """A combination of processor and operating system."""
 
     name: str  # platform tuple of FMI 3.0
-    fmi2_folder: str  # its name in FMI 2.0
+    system_folder: str  # its name in versions of FMI with `system_folders`
     suffix: str  # file name suffix of shared libraries
     zig_target: str  # its name in zig
     flags: tuple[str, ...] = ()  # compiler flags
 
     def folder(self, fmi_version: int) -> str:
         """Return the folder below binaries/ of an FMU."""
-        if fmi_version == 2:
-            return self.fmi2_folder
+        if DIALECTS[fmi_version].system_folders:
+            return self.system_folder
         return self.name
 
 
@@ -139,7 +141,7 @@ def library_files(
     files = {
         each.folder(fmi_version): (each.suffix, content) for each, content in libraries.items()
     }
-    if fmi_version == 2:
+    if DIALECTS[fmi_version].system_folders:
         named = {each.name: content for each, content in libraries.items()}
         mac = [named[name] for name in ("x86_64-darwin", "aarch64-darwin") if name in named]
         if mac:

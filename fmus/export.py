@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 
 from servobench.fmus.compiler import CODE, Platform, this_platform
+from servobench.fmus.dialect import export_dialect
 from servobench.fmus.model_description import Description, arm_sections, exporter
-from servobench.fmus.product import Product, c_files, check_version, documentation, word
+from servobench.fmus.product import Product, c_files, documentation, word
 from servobench.fmus.reference import reference_run, tables
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import ArmLayout, View, arm_groups, parameters_of
@@ -59,7 +60,7 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
-        check_version(self.fmi_version)
+        export_dialect(self.fmi_version)
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
 

@@ -11,6 +11,13 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import TypeAlias
 
+from servobench.fmus.dialect import (
+    DERIVATIVES,
+    INDICATORS,
+    INITIAL_UNKNOWNS,
+    OUTPUTS,
+    ExportDialect,
+)
 from servobench.fmus.variables import (
     DERIVATIVE,
     FIXED,
@@ -21,6 +28,7 @@ from servobench.fmus.variables import (
     SAMPLED,
     STATE,
     ArmLayout,
+    Group,
     Layout,
 )
 from servobench.plant.contract.checks import FloatArray
@@ -47,6 +55,7 @@ ATTRIBUTES = {
     OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
     SAMPLED: {"causality": "output", "variability": "discrete", "initial": "calculated"},
 }
+STARTED = (PARAMETER, FIXED, INPUT)  # roles with start values
 LOG_CATEGORIES = {
     "logStatusError": "Errors.",
     "logStatusWarning": "Refused calls.",
@@ -61,18 +70,14 @@ _Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole.
+    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole."""
 
-    FMI 2 has no element for event indicators.
-    """
-
-    fmi2: str
-    fmi3: str
+    part: str  # one of those whose elements an `ExportDialect` names
     layout: Layout
     unknowns: _Rows
 
     def scalars(self) -> Iterable[tuple[int, list[int]]]:
-        """Yield index and dependencies of every number; FMI 2 wants them in ascending order."""
+        """Yield index and dependencies of every number, these in ascending order."""
         for unknown, names, elementwise in self.unknowns:
             for k in range(self.layout.by_name[unknown].size):
                 dependencies: list[int] = []
@@ -121,10 +126,10 @@ def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
     start += [(name, (*geometry, "home"), False) for name in computed]
     indicators: _Rows = [("stop_indicator", ("joint_position", command), False)]
     return (
-        Section("Outputs", "Output", layout, outputs),
-        Section("Derivatives", "ContinuousStateDerivative", layout, derivatives),
-        Section("InitialUnknowns", "InitialUnknown", layout, start),
-        Section("", "EventIndicator", layout, indicators),
+        Section(OUTPUTS, layout, outputs),
+        Section(DERIVATIVES, layout, derivatives),
+        Section(INITIAL_UNKNOWNS, layout, start),
+        Section(INDICATORS, layout, indicators),
     )
 
 
@@ -133,8 +138,8 @@ def sampled_sections(layout: Layout) -> tuple[Section, ...]:
     inputs = tuple(group.name for group in layout.of_role(INPUT))
     rows: _Rows = [(group.name, inputs, False) for group in layout.of_role(SAMPLED)]
     return (
-        Section("Outputs", "Output", layout, rows),
-        Section("InitialUnknowns", "InitialUnknown", layout, rows),
+        Section(OUTPUTS, layout, rows),
+        Section(INITIAL_UNKNOWNS, layout, rows),
     )
 
 
@@ -159,22 +164,22 @@ def exporter() -> str:
     return f"servobench {metadata.version('servobench')}"
 
 
-def write_description(description: Description, version: int, token: str) -> bytes:
-    """Return modelDescription.xml of FMI 2.0 or 3.0 with its GUID or instantiation token."""
+def write_description(description: Description, dialect: ExportDialect, token: str) -> bytes:
+    """Return modelDescription.xml of a version of FMI with the token that importers pass on."""
     attributes = {
-        "fmiVersion": f"{version}.0",
+        "fmiVersion": f"{dialect.names.version}.0",
         "modelName": description.model_name,
-        "guid" if version == 2 else "instantiationToken": token,
+        dialect.names.token: token,
         "description": description.summary,
         "generationTool": exporter(),
         "license": "BSD-3-Clause",
         "variableNamingConvention": "structured",
     }
-    if version == 2:
+    if dialect.indicator_count is not None:
         indicators = description.layout.of_role(INDICATOR)
-        attributes["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
+        attributes[dialect.indicator_count] = str(sum(group.size for group in indicators))
     root = ET.Element("fmiModelDescription", attributes)
-    _interfaces(root, description, version)
+    _interfaces(root, description, dialect)
     _units(root, {group.unit for group in description.layout.groups})
     categories = ET.SubElement(root, "LogCategories")
     for name, text in LOG_CATEGORIES.items():
@@ -186,44 +191,28 @@ def write_description(description: Description, version: int, token: str) -> byt
         "stepSize": repr(description.step),
     }
     ET.SubElement(root, "DefaultExperiment", experiment)
-    _variables(ET.SubElement(root, "ModelVariables"), description, version)
+    variables = ET.SubElement(root, "ModelVariables")
     structure = ET.SubElement(root, "ModelStructure")
-    for section in description.sections:
-        if version == 3:
-            for reference, dependencies in section.arrays():
-                attributes = {"valueReference": str(reference)} | _dependent(dependencies)
-                ET.SubElement(structure, section.fmi3, attributes)
-        elif section.fmi2:
-            element = ET.SubElement(structure, section.fmi2)
-            for index, dependencies in section.scalars():
-                # FMI 2 counts variables from 1 here.
-                indices = [dependency + 1 for dependency in dependencies]
-                attributes = {"index": str(index + 1)} | _dependent(indices)
-                ET.SubElement(element, "Unknown", attributes)
+    if dialect.arrays:
+        _array_variables(variables, description)
+        _array_structure(structure, description, dialect)
+    else:
+        _scalar_variables(variables, description)
+        _scalar_structure(structure, description, dialect)
     return xml_bytes(root)
 
 
-def _interfaces(root: ET.Element, description: Description, version: int) -> None:
+def _interfaces(root: ET.Element, description: Description, dialect: ExportDialect) -> None:
     """Add model exchange, if there is one, and co-simulation with their capabilities."""
-    derivatives = str(description.exchange).lower()
-    state = "FMUstate" if version == 2 else "FMUState"
-    capabilities = {"modelIdentifier": description.model_identifier}
-    if version == 2:
-        capabilities["canNotUseMemoryManagementFunctions"] = "true"
-    capabilities[f"canGetAndSet{state}"] = "true"
-    capabilities[f"canSerialize{state}"] = "true"
-    if version == 2:
-        capabilities["providesDirectionalDerivative"] = derivatives
-    else:
-        capabilities["providesDirectionalDerivatives"] = derivatives
-        capabilities["providesAdjointDerivatives"] = derivatives
+    attributes = {"modelIdentifier": description.model_identifier}
+    attributes |= dict.fromkeys(dialect.capabilities, "true")
+    attributes |= dict.fromkeys(dialect.differentiation, str(description.exchange).lower())
     interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
     if description.exchange:
-        own = {"completedIntegratorStepNotNeeded": "false"} if version == 2 else {}
-        interfaces = {"ModelExchange": own, **interfaces}
+        interfaces = {"ModelExchange": dict(dialect.exchange), **interfaces}
     for name, more in interfaces.items():
-        interface = ET.SubElement(root, name, {**capabilities, **more})
-        if version == 2:
+        interface = ET.SubElement(root, name, {**attributes, **more})
+        if dialect.describes_sources:
             files = ET.SubElement(interface, "SourceFiles")
             for source in description.sources:
                 ET.SubElement(files, "File", name=source)
@@ -281,48 +270,101 @@ def _units(root: ET.Element, used: set[str]) -> None:
             ET.SubElement(unit, "DisplayUnit", name=DISPLAY_UNITS[name], factor=repr(180 / math.pi))
 
 
-def _variables(parent: ET.Element, description: Description, version: int) -> None:
-    """Add every number of FMI 2, every group and the time of FMI 3."""
+def _scalar_variables(parent: ET.Element, description: Description) -> None:
+    """Add every number as a variable."""
     layout = description.layout
     for group in layout.groups:
         first = layout.offsets[group.name]
-        starts = ["0.0"] * group.size
-        values = description.start.get(group.name)
-        if values is not None:
-            starts = [repr(float(value)) for value in values]
-        names = group.scalar_names() if version == 2 else [group.name]
-        for k, name in enumerate(names):
-            attributes = {"name": name, "valueReference": str(first + k), **ATTRIBUTES[group.role]}
-            attributes["description"] = group.description
-            real = {"unit": group.unit}
-            if group.unit in DISPLAY_UNITS:
-                real["displayUnit"] = DISPLAY_UNITS[group.unit]
-            if group.minimum is not None:
-                real["min"] = str(group.minimum)
-            if group.nominal is not None:
-                real["nominal"] = str(group.nominal)
-            if group.role in (PARAMETER, FIXED, INPUT):
-                real["start"] = starts[k] if version == 2 else " ".join(starts)
+        starts = _starts(group, description)
+        for k, name in enumerate(group.scalar_names()):
+            number = _number(group)
+            if group.role in STARTED:
+                number["start"] = starts[k]
             if group.role == DERIVATIVE:
-                state = layout.offsets[group.name.removeprefix("der(").removesuffix(")")]
-                real["derivative"] = str(state + k + 1 if version == 2 else state)
-            if version == 2:
-                scalar = ET.SubElement(parent, "ScalarVariable", attributes)
-                ET.SubElement(scalar, "Real", real)
-            else:
-                variable = ET.SubElement(parent, "Float64", attributes | real)
-                for size in group.shape:
-                    ET.SubElement(variable, "Dimension", start=str(size))
-    if version == 3:
-        time = {
-            "name": "time",
-            "valueReference": str(layout.size),
-            "causality": "independent",
-            "variability": "continuous",
-            "unit": "s",
-            "description": "Simulation time.",
-        }
-        ET.SubElement(parent, "Float64", time)
+                # Variables are counted from 1 here.
+                number["derivative"] = str(_state_offset(group, layout) + k + 1)
+            variable = ET.SubElement(parent, "ScalarVariable", _identity(group, name, first + k))
+            ET.SubElement(variable, "Real", number)
+
+
+def _array_variables(parent: ET.Element, description: Description) -> None:
+    """Add every group as a variable, and the time."""
+    layout = description.layout
+    for group in layout.groups:
+        attributes = _identity(group, group.name, layout.offsets[group.name]) | _number(group)
+        if group.role in STARTED:
+            attributes["start"] = " ".join(_starts(group, description))
+        if group.role == DERIVATIVE:
+            attributes["derivative"] = str(_state_offset(group, layout))
+        variable = ET.SubElement(parent, "Float64", attributes)
+        for size in group.shape:
+            ET.SubElement(variable, "Dimension", start=str(size))
+    time = {
+        "name": "time",
+        "valueReference": str(layout.size),
+        "causality": "independent",
+        "variability": "continuous",
+        "unit": "s",
+        "description": "Simulation time.",
+    }
+    ET.SubElement(parent, "Float64", time)
+
+
+def _identity(group: Group, name: str, reference: int) -> dict[str, str]:
+    """Return name, value reference, role and description of a variable."""
+    attributes = {"name": name, "valueReference": str(reference), **ATTRIBUTES[group.role]}
+    attributes["description"] = group.description
+    return attributes
+
+
+def _number(group: Group) -> dict[str, str]:
+    """Return units and bounds of the numbers of a group."""
+    attributes = {"unit": group.unit}
+    if group.unit in DISPLAY_UNITS:
+        attributes["displayUnit"] = DISPLAY_UNITS[group.unit]
+    if group.minimum is not None:
+        attributes["min"] = str(group.minimum)
+    if group.nominal is not None:
+        attributes["nominal"] = str(group.nominal)
+    return attributes
+
+
+def _starts(group: Group, description: Description) -> list[str]:
+    """Return the start value of each number of a group."""
+    values = description.start.get(group.name)
+    if values is None:
+        return ["0.0"] * group.size
+    return [repr(float(value)) for value in values]
+
+
+def _state_offset(derivative: Group, layout: Layout) -> int:
+    """Return the offset of the state whose derivative a group is."""
+    return layout.offsets[derivative.name.removeprefix("der(").removesuffix(")")]
+
+
+def _scalar_structure(
+    structure: ET.Element, description: Description, dialect: ExportDialect
+) -> None:
+    """Add a list of unknowns for every part of the model structure."""
+    for section in description.sections:
+        if section.part in dialect.sections:
+            element = ET.SubElement(structure, dialect.sections[section.part])
+            for index, dependencies in section.scalars():
+                # Variables are counted from 1 here.
+                indices = [dependency + 1 for dependency in dependencies]
+                attributes = {"index": str(index + 1)} | _dependent(indices)
+                ET.SubElement(element, "Unknown", attributes)
+
+
+def _array_structure(
+    structure: ET.Element, description: Description, dialect: ExportDialect
+) -> None:
+    """Add the unknowns of every part of the model structure."""
+    for section in description.sections:
+        if section.part in dialect.sections:
+            for reference, dependencies in section.arrays():
+                attributes = {"valueReference": str(reference)} | _dependent(dependencies)
+                ET.SubElement(structure, dialect.sections[section.part], attributes)
 
 
 def _dependent(dependencies: list[int]) -> dict[str, str]:

@@ -17,6 +17,7 @@ from typing import Final
 from uuid import UUID
 
 from servobench.fmus.compiler import Platform, compile_library, library_files
+from servobench.fmus.dialect import ExportDialect, export_dialect
 from servobench.fmus.model_description import (
     REFERENCES,
     Description,
@@ -30,10 +31,6 @@ from servobench.fmus.variables import Layout
 from servobench.plant.contract.files import accessing, write_atomically
 
 MACHINERY: Final = "fmi"  # folder of the FMI functions, which serve every model
-HEADERS: Final = {
-    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
-}
 ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 UNIX: Final = 3  # system of an entry in a zip archive, which says how its mode is to be read
 PLACEHOLDER: Final = "{token}"
@@ -55,7 +52,7 @@ RELATED_FILES: Final = (
 class Product:
     """The content of an FMU."""
 
-    fmi_version: int  # 2 or 3
+    fmi_version: int  # one of `EXPORTS`
     folder: str  # folder of the model below `fmus`, with model.c, model.h and license.txt
     core: str  # name of the generated C file and of its header in that folder
     source: str  # text of that C file
@@ -63,6 +60,11 @@ class Product:
     description: Description  # description of the model
     documentation: str  # HTML
     reference: tuple[str, str]  # text of the reference run's inputs and outputs
+
+    @property
+    def dialect(self) -> ExportDialect:
+        """The names of its version of FMI."""
+        return export_dialect(self.fmi_version)
 
     def sources(self) -> dict[str, str]:
         """Return the C files by their path in the archive, with a placeholder for the token."""
@@ -72,13 +74,13 @@ class Product:
             "instance.h",
             "instance.c",
             "shared_functions.h",
-            f"fmi{self.fmi_version}.c",
+            f"{self.dialect.names.prefix}.c",
         )
         texts = {name: committed(MACHINERY, name) for name in machinery}
         for name in (f"{self.core}.h", "model.h", "model.c"):
             texts[name] = committed(self.folder, name)
         standard = files("fmpy") / "c-code"
-        for name in HEADERS[self.fmi_version]:
+        for name in self.dialect.headers:
             texts[name] = (standard / name).read_text(encoding="utf-8")
         texts[f"{self.core}.c"] = self.source
         texts["layout.h"] = layout_header(
@@ -88,9 +90,9 @@ class Product:
 
     def descriptions(self, token: str) -> dict[str, bytes]:
         """Return the XML files by their path in the archive."""
-        description = write_description(self.description, self.fmi_version, token)
+        description = write_description(self.description, self.dialect, token)
         contents = {"modelDescription.xml": description}
-        if self.fmi_version == 3:
+        if not self.dialect.describes_sources:
             contents["sources/buildDescription.xml"] = write_build_description(self.description)
         return contents
 
@@ -152,19 +154,9 @@ class Product:
         return library_files(libraries, identifier, self.fmi_version)
 
 
-def check_version(fmi_version: int) -> None:
-    """Refuse a version of FMI that is not exported.
-
-    Raises:
-        ValueError: neither 2 nor 3.
-    """
-    if fmi_version not in HEADERS:
-        raise ValueError(f"fmi_version must be 2 or 3, got {fmi_version}")
-
-
 def c_files(fmi_version: int, core: str) -> tuple[str, ...]:
     """Return the C files to compile, in order."""
-    return (f"fmi{fmi_version}.c", "model.c", "instance.c", f"{core}.c")
+    return (f"{export_dialect(fmi_version).names.prefix}.c", "model.c", "instance.c", f"{core}.c")
 
 
 def committed(folder: str, name: str) -> str:

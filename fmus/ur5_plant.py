@@ -2,7 +2,6 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.cache import BUILT, cached
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import Delay, NonNegative, settings
+from servobench.plant.fmu.dialect import FmiVersion
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.kinematic import ArmConfig, KinematicConfig
 from servobench.plant.robot.robot import Robot
@@ -23,7 +23,7 @@ from servobench.plant.robot.robot import Robot
 class Ur5FmuConfig(ArmConfig):
     """Settings of the exported arm."""
 
-    fmi_version: Literal[2, 3] = 2
+    fmi_version: FmiVersion = 2
     """Version of FMI."""
     joint_lags: tuple[Delay, ...] = ()
     """[s] τ of each of the joints in place of `lag`; an empty list for none."""

@@ -19,6 +19,7 @@ from typing import Any, Final, Self
 from servobench.plant.contract.settings import suggest
 from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.archive import DESCRIPTION
+from servobench.plant.fmu.dialect import DIALECTS, FmiDialect
 
 REAL_TYPES: Final = ("Real", "Float64", "Float32")
 NUMERIC: Final = (*REAL_TYPES, "Integer", "Boolean", "Int32")
@@ -60,7 +61,7 @@ class FmuDescription:
 
     path: Path  # the .fmu file, for messages.
     root: Path  # folder to which it is extracted
-    version: int  # 2 or 3
+    version: int  # one of `DIALECTS`
     model_name: str  # for people
     identifier: str  # file name of the library
     token: str  # GUID or instantiation token
@@ -77,6 +78,11 @@ class FmuDescription:
     )
     usual_step: float | None = None  # that of its default experiment, s; None for none
     start_time: float = 0.0  # that of its default experiment, s; NaN for one that is no number
+
+    @property
+    def dialect(self) -> FmiDialect:
+        """The names of its version of FMI."""
+        return DIALECTS[self.version]
 
     @cached_property
     def _by_name(self) -> dict[str, Variable]:
@@ -169,7 +175,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         ValueError: broken, of FMI 1, or with scheduled execution only.
     """
     description = parse_description(path, root)
-    version = str(description.fmiVersion)
+    version = int(description.fmiVersion[0])
     interface = description.coSimulation or description.modelExchange
     if interface is None:
         raise ValueError(
@@ -182,12 +188,12 @@ def read_description(path: Path, root: Path) -> FmuDescription:
             "wanted letters, digits and '_', without folders"
         )
     units = {each.name: each.baseUnit for each in description.unitDefinitions}
-    token = description.guid if version.startswith("2") else description.instantiationToken
     variables = [_variable(each, path, units) for each in description.modelVariables]
+    token = getattr(description, DIALECTS[version].token)
     return FmuDescription(
         path=path,
         root=root,
-        version=int(version[0]),
+        version=version,
         model_name=str(description.modelName),
         identifier=identifier,
         token=str(token),
@@ -257,7 +263,7 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
     """Return fmpy's model description of the FMU at `path`, extracted to `root`.
 
     Raises:
-        ValueError: broken, or of another version than FMI 2 and 3.
+        ValueError: broken, or of another version than those of `DIALECTS`.
     """
     from fmpy import read_model_description  # noqa: PLC0415 - takes a third of a second and loads libraries
 
@@ -266,8 +272,9 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
     except (ET.ParseError, LookupError, ValueError, OSError) as error:
         # A LookupError is an unknown encoding.
         raise ValueError(f"fmu file {path} has a broken {DESCRIPTION}: {_line(error)}") from error
-    if not version.startswith(("2.", "3.")):
-        raise ValueError(f"fmu file {path} is of FMI {_line(version)}; wanted FMI 2 or 3")
+    if not version.startswith(tuple(f"{known}." for known in DIALECTS)):
+        wanted = " or ".join(map(str, DIALECTS))
+        raise ValueError(f"fmu file {path} is of FMI {_line(version)}; wanted FMI {wanted}")
     try:
         return read_model_description(str(root), validate=False)
     except Exception as error:  # fmpy raises exceptions of every kind.

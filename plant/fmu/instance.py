@@ -12,7 +12,7 @@ import contextlib
 import ctypes
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,12 +24,11 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
+from servobench.plant.fmu.dialect import FmiDialect
 from servobench.plant.fmu.library import Library, MessageLog
 from servobench.plant.fmu.release import release
 
 Call: TypeAlias = Callable[[], None]
-# Type of a variable -> word in the names of functions, type in memory
-Kinds: TypeAlias = Mapping[str, tuple[str, Any]]
 RawCall: TypeAlias = Callable[[], int]  # The caller has to check the returned status.
 # Statuses of FMI.
 OK: Final = 0
@@ -82,14 +81,7 @@ class Port:
 class Instance(ABC):
     """One instance of an FMU."""
 
-    prefix: ClassVar[str]  # begins the names of all functions in the library
-    # Word for real numbers in the names of the functions that read and write them.
-    real: ClassVar[str]
-    kinds: ClassVar[Kinds]  # the same word for each numeric type, and how its numbers lie in memory
-    state: ClassVar[str]  # word for states in the names of their functions
-    deserialise: ClassVar[str]  # the verb of the function that reads a state from bytes
-    early: ClassVar[str]  # word for a step that ended early
-    derivatives: ClassVar[str]  # name of the function that reads the states' derivatives
+    dialect: ClassVar[FmiDialect]  # the version of FMI
 
     def __init__(
         self, description: FmuDescription, tolerance: float | None, debug_log: Path | None
@@ -189,9 +181,8 @@ class Instance(ABC):
         call = self.step_call(now, rest)
         while reached is not None:
             if not reached > time + least:
-                raise self.log.failure(
-                    f"{self.prefix}DoStep", f"{self.early} at {reached:.6g} s, no further"
-                )
+                outcome = f"{self.dialect.early} at {reached:.6g} s, no further"
+                raise self.log.failure(f"{self.dialect.prefix}DoStep", outcome)
             if reached > end - least:
                 return
             time = reached
@@ -211,9 +202,11 @@ class Instance(ABC):
     def access(self, verb: Literal["Get", "Set"], port: Port, row: int = 0) -> RawCall:
         """Return a function that reads or writes the port's variables by a row of its buffer, for the inner loop."""
         width = port.values.shape[-1]
-        if all(self.kinds[variable.type] == self.kinds[self.real] for variable in port.members):
+        real = self.dialect.real
+        kinds = self.dialect.kinds
+        if all(kinds[variable.type] == kinds[real] for variable in port.members):
             # One call of C for all variables, without a copy.
-            function = self.function(f"{verb}{self.real}")
+            function = self.function(f"{verb}{real}")
             place = self._buffer(port.pointer(row), width)
             return partial(function, self._component, *port.variables, *place)
         values = port.values.reshape(-1, width)[row]
@@ -228,7 +221,7 @@ class Instance(ABC):
         self, verb: Literal["Get", "Set"], variable: Variable, values: FloatArray
     ) -> RawCall:
         """Return a function that reads or writes one variable of any numeric type by `values`."""
-        word, kind = self.kinds[variable.type]
+        word, kind = self.dialect.kinds[variable.type]
         buffer: npt.NDArray[Any] = np.zeros(variable.size, dtype=kind)
         function = self.function(f"{verb}{word}")
         place = self._buffer(ctypes.c_void_p(buffer.ctypes.data), variable.size)
@@ -287,25 +280,25 @@ class Instance(ABC):
         if isinstance(saved, bytes):
             self.restore_bytes(saved)
         else:
-            self.call(f"Set{self.state}", saved)
+            self.call(f"Set{self.dialect.state}", saved)
 
     def _state(self) -> ctypes.c_void_p:
         """Return a handle of the present state, which has to be given to `_free`."""
         state = ctypes.c_void_p()
-        self.call(f"Get{self.state}", ctypes.byref(state))
+        self.call(f"Get{self.dialect.state}", ctypes.byref(state))
         return state
 
     def _free(self, state: ctypes.c_void_p) -> None:
-        self.call(f"Free{self.state}", ctypes.byref(state))
+        self.call(f"Free{self.dialect.state}", ctypes.byref(state))
 
     def save_bytes(self) -> bytes:
         """Return the present state as bytes that another process understands."""
         state = self._state()
         try:
             size = ctypes.c_size_t()
-            self.call(f"Serialized{self.state}Size", state, ctypes.byref(size))
+            self.call(f"Serialized{self.dialect.state}Size", state, ctypes.byref(size))
             content = (ctypes.c_char * size.value)()
-            self.call(f"Serialize{self.state}", state, content, size)
+            self.call(f"Serialize{self.dialect.state}", state, content, size)
             return bytes(content)
         finally:
             self._free(state)
@@ -314,7 +307,8 @@ class Instance(ABC):
         """Return to a state from `save_bytes`."""
         state = ctypes.c_void_p()
         size = ctypes.c_size_t(len(content))
-        self.call(f"{self.deserialise}{self.state}", content, size, ctypes.byref(state))
+        function = f"{self.dialect.deserialise}{self.dialect.state}"
+        self.call(function, content, size, ctypes.byref(state))
         try:
             self.restore(state)
         finally:
@@ -361,7 +355,8 @@ class Instance(ABC):
             raise FmuError(
                 f"{self.description.path.name} reported a fatal error before, so it cannot be called again"
             )
-        self.check(f"{self.prefix}{name}", self.function(name)(self._component, *arguments))
+        status = self.function(name)(self._component, *arguments)
+        self.check(f"{self.dialect.prefix}{name}", status)
 
     def function(self, name: str) -> Any:  # noqa: ANN401 - a ctypes function
         """Return a function of the library by its name without prefix.
@@ -369,11 +364,12 @@ class Instance(ABC):
         Raises:
             FmuError: the library does not have it.
         """
+        full_name = f"{self.dialect.prefix}{name}"
         try:
-            return getattr(self.library.loaded, f"{self.prefix}{name}")
+            return getattr(self.library.loaded, full_name)
         except AttributeError as error:
             file = self.description.path.name
-            raise FmuError(f"the library in {file} does not export {self.prefix}{name}") from error
+            raise FmuError(f"the library in {file} does not export {full_name}") from error
 
 
 class Integrator:
@@ -467,6 +463,7 @@ class Integrator:
                 f"{name} offers model exchange only, and fmpy has no solver for this machine"
             ) from error
         instance = self._instance
+        derivatives = instance.dialect.derivatives
         # Inputs stay as they are within a step.
         held_inputs = SimpleNamespace(apply=lambda _time: None)
         return CVodeSolver(
@@ -474,7 +471,7 @@ class Integrator:
             nz=instance.description.n_indicators,
             get_x=self._vector("GetContinuousStates"),
             set_x=self._vector("SetContinuousStates"),
-            get_dx=self._vector(instance.derivatives),
+            get_dx=self._vector(derivatives),
             get_z=self._vector("GetEventIndicators"),
             get_nominals=self._vector("GetNominalsOfContinuousStates"),
             set_time=self._guarded(lambda now: instance.call("SetTime", ctypes.c_double(now))),

@@ -9,27 +9,22 @@ import ctypes
 import math
 import os
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Final
-
-import numpy as np
+from typing import Any, Final
 
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription
-from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Kinds, Port, RawCall
+from servobench.plant.fmu.dialect import FMI2, FMI3
+from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Port, RawCall
 from servobench.plant.fmu.library import MessageLog, plain_root
 
 # Codes of FMI 2: types of an FMU, and a status that can be asked for.
 MODEL_EXCHANGE: Final = 0
 CO_SIMULATION: Final = 1
 LAST_SUCCESSFUL_TIME: Final = 2
-# Whole numbers of FMI 3 -> their type in memory.
-WHOLE_TYPES: Final = {
-    f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +127,7 @@ def open_instance(
         ValueError: no library for this machine, or one that cannot be loaded.
         FmuError: the FMU refused to make an instance.
     """
-    kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
-    return kind(description, tolerance, debug_log)
+    return INSTANCES[description.version](description, tolerance, debug_log)
 
 
 _Logger = ctypes.CFUNCTYPE(
@@ -157,18 +151,7 @@ _on_message = _Logger(_log_message)
 class Instance2(Instance):
     """One instance of an FMI 2.0 FMU."""
 
-    prefix = "fmi2"
-    real = "Real"
-    state = "FMUstate"
-    deserialise = "DeSerialize"
-    early = "discard"
-    derivatives = "GetDerivatives"
-    kinds: ClassVar[Kinds] = {
-        "Real": ("Real", np.float64),
-        "Integer": ("Integer", np.int32),
-        "Enumeration": ("Integer", np.int32),
-        "Boolean": ("Boolean", np.int32),
-    }
+    dialect = FMI2
 
     def _instantiate(self) -> int | None:
         self._callbacks = _callbacks(self.log)
@@ -261,19 +244,7 @@ LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char
 class Instance3(Instance):
     """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
 
-    prefix = "fmi3"
-    real = "Float64"
-    state = "FMUState"
-    deserialise = "Deserialize"
-    early = "early"
-    derivatives = "GetContinuousStateDerivatives"
-    kinds: ClassVar[Kinds] = {
-        "Float64": ("Float64", np.float64),
-        "Float32": ("Float32", np.float32),
-        **{word: (word, kind) for word, kind in WHOLE_TYPES.items()},
-        "Enumeration": ("Int64", np.int64),
-        "Boolean": ("Boolean", np.bool_),
-    }
+    dialect = FMI3
 
     def _instantiate(self) -> int | None:
         log = self.log
@@ -358,3 +329,8 @@ class Instance3(Instance):
         self.call("EnterConfigurationMode")
         self.writer(port)()
         self.call("ExitConfigurationMode")
+
+
+INSTANCES: Final[Mapping[int, type[Instance2 | Instance3]]] = {
+    kind.dialect.version: kind for kind in (Instance2, Instance3)
+}

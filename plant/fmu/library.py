@@ -38,9 +38,9 @@ class Library:
         binaries = root / "binaries"
         wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
         lacking = f"fmu file {description.path} has no library for this machine; wanted"
-        # FMI 2 has names of its own for platforms; many of its FMUs bear those of FMI 3.
+        # Many FMUs of FMI 2 bear the names of platforms of FMI 3.
         folders = [fmpy.platform_tuple]
-        if description.version == 2:
+        if description.dialect.system_folders:
             folders.append(fmpy.platform)
         for folder in folders:
             file = binaries / folder / wanted

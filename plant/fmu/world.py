@@ -33,8 +33,9 @@ from servobench.plant.fmu.description import (
     read_description,
     total_size,
 )
+from servobench.plant.fmu.dialect import WHOLE_TYPES
 from servobench.plant.fmu.instance import Instance, Port
-from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
+from servobench.plant.fmu.instances import Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
 from servobench.plant.fmu.mapping import (
     FmuMapping,

@@ -92,7 +92,7 @@ def export(
     overrides: options.Overrides,
 ) -> None:
     """Export an arm with a mismatch as start values, or a controller."""
-    from servobench.fmus.product import check_version
+    from servobench.fmus.dialect import export_dialect
     from servobench.harness.apps.fmu.products import arm_product, controller_model
 
     settings = overrides.settings()
@@ -113,7 +113,7 @@ def export(
             )
             product = arm_product(request, words, fmi)
         else:
-            check_version(fmi)
+            export_dialect(fmi)
             product = controller_model(request, settings).product(fmi)
         product.write(output, platforms)
     names = ", ".join(platform.name for platform in platforms)
