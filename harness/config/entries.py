@@ -21,8 +21,8 @@ from typing import Any, Final, Generic, Protocol, TypeVar, get_type_hints
 
 import numpy as np
 
+from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
-from servobench.controllers.methods import with_aids
 from servobench.harness.config.source import (
     SourceFile,
     describe_at,

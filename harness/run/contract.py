@@ -11,8 +11,8 @@ from typing import Any, Final, final
 
 import numpy as np
 
+from servobench.controllers.aided import AidedController
 from servobench.controllers.controller import Controller, Diagnostics
-from servobench.controllers.methods import AidedController
 from servobench.controllers.servo import ServoController
 from servobench.harness.run.result import WrongAnswer
 from servobench.plant.bench.bench import Bench

@@ -9,9 +9,9 @@ from typing import Any, Final, cast
 
 import numpy as np
 
+from servobench.controllers.aided import AidedController, with_aids
 from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.controllers.methods import AidedController, with_aids
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.apps.check.report import (
     Check,
