@@ -50,7 +50,8 @@ def shadow(
 
     Nothing is simulated: its commands do not change the log. Its Jacobian predicts each feature from the frame before.
     """
-    from servobench.harness.apps.twin.shadow import differences, predictions
+    from servobench.harness.apps.twin.predictions import predictions
+    from servobench.harness.apps.twin.shadow import differences
     from servobench.harness.apps.twin.shadow import shadow as see
     from servobench.harness.config.registry import find_controller
 
@@ -100,7 +101,8 @@ def identify(
     from servobench.harness.apps.twin.drive import command_response
     from servobench.harness.apps.twin.identification import read_log
     from servobench.harness.apps.twin.preflight import mistakes
-    from servobench.harness.apps.twin.twin_file import estimates, remarks, twin_text
+    from servobench.harness.apps.twin.summary import estimates, remarks
+    from servobench.harness.apps.twin.twin_file import twin_text
     from servobench.harness.batch.logs import UnevenRows
     from servobench.harness.config.sensing import find_sensing
     from servobench.harness.run.experiment import build

@@ -29,14 +29,9 @@ from servobench.harness.apps.twin.identification import (
     robust_covariance,
 )
 from servobench.harness.apps.twin.preflight import mistakes
-from servobench.harness.apps.twin.twin_file import (
-    estimates,
-    frame_period,
-    lost_share,
-    remarks,
-    sensor,
-    twin_text,
-)
+from servobench.harness.apps.twin.sensor import frame_period, lost_share, sensor
+from servobench.harness.apps.twin.summary import estimates, remarks
+from servobench.harness.apps.twin.twin_file import twin_text
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.sampling import draw_robot

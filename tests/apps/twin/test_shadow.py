@@ -10,7 +10,8 @@ import pytest
 from kit.broken_controllers import stepping
 from kit.command import servobench
 from servobench import compare, run
-from servobench.harness.apps.twin.shadow import COMMAND, LOGGED, differences, predictions, shadow
+from servobench.harness.apps.twin.predictions import predictions
+from servobench.harness.apps.twin.shadow import COMMAND, LOGGED, differences, shadow
 from servobench.harness.batch.logs import _period, logged_in_file, logged_in_folder
 from servobench.harness.batch.results import read_manifest, write_manifest
 from servobench.harness.config.registry import choose_controller
