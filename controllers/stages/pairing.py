@@ -61,7 +61,8 @@ DOUBT_GATE: Final = 100.0  # [1] g
 TAKE_BACK_RATIO: Final = 0.5  # [1]
 # A motion since the anchor is doubtful no longer if it is longer than this many motions of the least length.
 MAX_DOUBTFUL_GAP: Final = 4
-MAP_WALK: Final = 0.1  # [1/√m] w, random walk of an entry of M
+# w, random walk of an entry of M over the motion of the feature.
+MAP_LENGTH_WALK: Final = 0.1  # [1/√m]
 REST_DEVIATION: Final = 0.2  # [m/rad] prior deviation of an entry of E
 REST_WALK: Final = 0.1  # [m/rad/√rad] u, random walk of an entry of E
 UNEXPLAINED_SHARE: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
@@ -454,7 +455,7 @@ class Pairing:
         frame = state.noise.variance
         lengths = norm(h[..., :m])
         turns = norm(h[..., m:])
-        walks = np.stack([MAP_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1)
+        walks = np.stack([MAP_LENGTH_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1)
         walk = np.repeat(walks, (m, self._n), axis=-1)
         unexplained = UNEXPLAINED_SHARE**2 * (lengths * lengths)
         learns = lengths * lengths >= frame[..., None]

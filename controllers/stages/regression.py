@@ -63,7 +63,8 @@ PRIOR: Final = np.array([0.0, 6.0, 6.0, 12.0])  # [1] −2 ln of the prior proba
 MODEL_ERROR: Final = 0.02  # [m/rad] c, deviation of the unexplained motion
 # [1/√rad] random walk of an entry of E or H, as a share of its prior deviation
 WALK: Final = np.array([0.0, 0.0, 0.1, 0.1])
-MAP_WALK: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad] random walk of an entry of M
+# Random walk of an entry of M over the motion of the joints, in each filter.
+MAP_TURN_WALKS: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad]
 # [1] ς, deviation of an entry of M from the nearest rotation; filters beyond these have any M
 ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])
 
@@ -215,7 +216,7 @@ class Regression:
         arm = n + len(self._pairs[0])
         self._map = slice(arm, arm + m)
         arm_variances = np.repeat(DEVIATIONS[:, None] ** 2, arm, axis=1)
-        map_walks = np.repeat(MAP_WALK[:, None] ** 2, m, axis=1)
+        map_walks = np.repeat(MAP_TURN_WALKS[:, None] ** 2, m, axis=1)
         self._P0 = np.concatenate([arm_variances, np.ones((len(DEVIATIONS), m))], axis=1)
         self._walk = np.concatenate([WALK[:, None] ** 2 * arm_variances, map_walks], axis=1)
 

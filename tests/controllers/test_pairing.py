@@ -134,7 +134,7 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
         )
         S += pairing.REST_DEVIATION**2 * H[:, M:] @ H[:, M:].T
         for part, walk, way in (
-            (H[:, :M], pairing.MAP_WALK, lengths),
+            (H[:, :M], pairing.MAP_LENGTH_WALK, lengths),
             (H[:, M:], pairing.REST_WALK, turns),
         ):
             S += walk**2 * np.minimum.outer(np.cumsum(way), np.cumsum(way)) * (part @ part.T)

@@ -225,7 +225,7 @@ def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypa
     odds = -0.5 * stage.PRIOR
     for b, deviation in enumerate(stage.DEVIATIONS):
         prior = np.repeat([deviation, 1.0], (QUADRATIC, M)) ** 2
-        walk = np.repeat([stage.WALK[b] * deviation, stage.MAP_WALK[b]], (QUADRATIC, M)) ** 2
+        walk = np.repeat([stage.WALK[b] * deviation, stage.MAP_TURN_WALKS[b]], (QUADRATIC, M)) ** 2
         S = moving_average(
             stage.REST_DRIFT**2 * PERIOD + (stage.MODEL_ERROR * lengths) ** 2, run.frame
         )
