@@ -58,18 +58,19 @@ class Rig(Plant):
             m: number of features.
             period: [s] between two commands.
         """
-        self.conditions, self.farthest = Conditions(), 0.0
+        self.conditions = Conditions()
+        self.farthest = 0.0
         rng = np.random.default_rng([n, m, 0])
         left, _, right = np.linalg.svd(rng.normal(size=(m, n)), full_matrices=False)
-        self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
+        sizes = np.linspace(0.4, 0.8, min(n, m))
+        self.A = left * sizes @ right  # [m/rad], well conditioned
         self.places = rng.uniform(-0.5, 0.5, (2, 2, n))  # start and goal [rad] of each seed
         self.start, self.goal = self.places[0]
-        joints, features = (
-            tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("q", n), ("y", m))
-        )
-        self.spec = PlantSpec.of_joints(
-            joints, features, np.full(n, 1.0), np.full(n, -6.0), np.full(n, 6.0), period
-        )
+        joints = tuple(f"q{i}" for i in range(n))
+        features = tuple(f"y{i}" for i in range(m))
+        speeds = np.full(n, 1.0)  # [rad/s]
+        range_ = np.full(n, 6.0)  # [rad] to either side
+        self.spec = PlantSpec.of_joints(joints, features, speeds, -range_, range_, period)
 
     def feature(self, q: FloatArray) -> FloatArray:
         """Return the true feature (..., m) [m] at joint positions (..., n) [rad]."""
@@ -86,20 +87,27 @@ class Rig(Plant):
 
     def knowledge(self, *, truth: bool = False) -> RobotKnowledge:
         """Return the knowledge of a controller; with `truth` also that of an upper bound."""
-        side, delays = np.ones(self.spec.n), Delays(0.0, 0.0, 0.0)
-        preview, region = self.conditions.preview, (-side, side)
+        side = np.ones(self.spec.n)
         known = RobotKnowledge(
-            self.spec, preview, self.model_jacobian, region=region, train=self._train
+            self.spec,
+            self.conditions.preview,
+            self.model_jacobian,
+            region=(-side, side),
+            train=self._train,
         )
         if not truth:
             return known
         return replace(
-            known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=delays
+            known,
+            true_jacobian=self.jacobian,
+            true_symbolic=self._symbolic,
+            true_delays=Delays(0.0, 0.0, 0.0),
         )
 
     def reset(self, seed: int) -> Observation:
         """See `Plant.reset`; the arm stands at its start, or at its goal."""
-        self._rng, self._k = np.random.default_rng(seed), 0
+        self._rng = np.random.default_rng(seed)
+        self._k = 0
         self.q = self.goal if self.conditions.at_goal else self.start
         return self._observe()
 
@@ -113,13 +121,14 @@ class Rig(Plant):
         return self._observe()
 
     def _observe(self) -> Observation:
-        feature, time = self.feature(self.q), self._k * self.spec.period
+        feature = self.feature(self.q)
+        time = self._k * self.spec.period
         if self.conditions.at_goal:
             return Observation(time, self.q, feature)
         noisy = feature + self._rng.normal(scale=NOISE, size=self.spec.m)
-        return Observation(
-            time, self.q, self.conditions.scale * noisy, self._k not in self.conditions.lost
-        )
+        measured = self.conditions.scale * noisy
+        valid = self._k not in self.conditions.lost
+        return Observation(time, self.q, measured, valid)
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
@@ -249,15 +258,16 @@ class Shared:
 
     def __init__(self, kind: type) -> None:
         """Keep their values."""
-        modules = {each.__module__: sys.modules.get(each.__module__) for each in kind.__mro__}
-        users = {
-            name: each
-            for name, each in modules.items()
-            if is_users(getattr(each, "__file__", None) or "<")
-        }
-        self._owners = users | {
-            each.__name__: each for each in kind.__mro__ if each.__module__ in users
-        }
+        modules: dict[str, object] = {}
+        classes: dict[str, object] = {}
+        for each in kind.__mro__:
+            name = each.__module__
+            module = sys.modules.get(name)
+            file = getattr(module, "__file__", None) or "<"
+            if is_users(file):
+                modules[name] = module
+                classes[each.__name__] = each
+        self._owners = modules | classes
         self._before = {name: attributes(each) for name, each in self._owners.items()}
         self._known = {name: {*vars(each)} for name, each in self._owners.items()}
 

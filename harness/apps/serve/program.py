@@ -36,17 +36,14 @@ UNLOCK_AFTER: Final = (
 
 def script_version(script: bytes) -> tuple[str, bool]:
     """Return words for the version of `ur-rtde` that sends a control script, and whether this one is served."""
-    digest, stamp, known = (
-        hashlib.sha256(script).hexdigest(),
-        STAMP.search(script),
-        CONTROLLER["scripts"],
-    )
+    digest = hashlib.sha256(script).hexdigest()
+    known = CONTROLLER["scripts"]
     if digest in known:
-        return f"ur-rtde {known[digest]}", digest == next(iter(known))
-    return (
-        f"{len(script)} bytes, dated {stamp[1].decode() if stamp else 'nowhere'}, SHA-256 {digest[:12]}…",
-        False,
-    )
+        newest = next(iter(known))
+        return f"ur-rtde {known[digest]}", digest == newest
+    stamp = STAMP.search(script)
+    date = stamp[1].decode() if stamp else "nowhere"
+    return f"{len(script)} bytes, dated {date}, SHA-256 {digest[:12]}…", False
 
 
 def begins_script(text: bytes) -> bool:
@@ -94,7 +91,10 @@ class ControlProgram:
         self, spec: PlantSpec, drive: TrueModel, say: Callable[[str], None], *, lockstep: bool
     ) -> None:
         """Take spec and drive of the plant, and a printer of lines; in lockstep accelerations have no limit."""
-        self._spec, self._drive, self._say, self._lockstep = spec, drive, say, lockstep
+        self._spec = spec
+        self._drive = drive
+        self._say = say
+        self._lockstep = lockstep
         self.inputs: dict[str, Any] = {}
         self.stopped_at: float | None = None
         self._rest: FloatArray = np.zeros(spec.n)
@@ -107,9 +107,13 @@ class ControlProgram:
 
     def begin(self, *, running: bool = True) -> None:
         """Begin the program anew, or forget the one that ran."""
-        self.running, self.progress = running, int(running)
-        self.busy = self._awaited = self._executing = False
-        self._silence, self._watchdog = 0, math.inf
+        self.running = running
+        self.progress = int(running)
+        self.busy = False
+        self._awaited = False
+        self._executing = False
+        self._silence = 0
+        self._watchdog = math.inf
         self._motion: Iterator[FloatArray] | None = self._ramp(self._rest, STOP_DECELERATION)
 
     def stop(self, why: str) -> None:
@@ -124,7 +128,9 @@ class ControlProgram:
         self._say(f"protective stop: {why}")
         self.stopped_at = time.monotonic()
         self.stop("by a protective stop")
-        self.velocity, self._motion, self.busy = self._rest, None, False
+        self.velocity = self._rest
+        self._motion = None
+        self.busy = False
 
     def unlock(self) -> bool:
         """End a protective stop if it lasted long enough, and return whether none is left."""
@@ -146,7 +152,8 @@ class ControlProgram:
         if command in WITHOUT_ANSWER:
             self._carry_out(command)
         elif command == 0:
-            self._executing, self.progress = False, 1
+            self._executing = False
+            self.progress = 1
         elif not self._executing:
             self._executing = True
             self._carry_out(command)
@@ -157,21 +164,24 @@ class ControlProgram:
 
     def advance(self) -> FloatArray:
         """Return the joint velocities of the next period, (n,) [rad/s], and count the time of the watchdog."""
-        self._silence, limit = self._silence + 1, self._spec.joint_velocity_limit
+        self._silence += 1
+        limit = self._spec.joint_velocity_limit
         if (silent := self._silence * self._spec.period) > self._watchdog:
             self.stop(f"by its watchdog, after {silent:.3g} s without a command")
         if self._motion is not None:
             try:
                 self.velocity = np.clip(next(self._motion), -limit, limit)
             except StopIteration:
-                self._motion, self.velocity = None, self._rest
+                self._motion = None
+                self.velocity = self._rest
                 self._arrive()
         return self.velocity
 
     def _arrive(self) -> None:
         self.busy = False
         if self._awaited:
-            self._awaited, self.progress = False, 2
+            self._awaited = False
+            self.progress = 2
 
     def _carry_out(self, command: int) -> None:
         name = COMMANDS[command] if 0 < command < len(COMMANDS) else "-"
@@ -196,8 +206,10 @@ class ControlProgram:
         return rate
 
     def _reachable(self) -> FloatArray:
-        target, spec = self._numbers(0, self._spec.n), self._spec
-        if ((target < spec.joint_lower) | (target > spec.joint_upper)).any():
+        spec = self._spec
+        target = self._numbers(0, spec.n)
+        outside = (target < spec.joint_lower) | (target > spec.joint_upper)
+        if outside.any():
             raise ValueError(
                 f"its target must be within the joints' limits, got {target.tolist()} rad"
             )
@@ -207,11 +219,13 @@ class ControlProgram:
         """Move along a trapezoidal profile, corrected by the distance from its present point."""
         if self.inputs.get("input_int_register_1", 0):
             raise ValueError("asynchronous moves are not served")
-        start, target, period = self.joints, self._reachable(), self._spec.period
-        speed = min(self._rate("speed", 6), float(self._spec.joint_velocity_limit.min()))
-        duration, done = profile(
-            float(np.abs(target - start).max()), speed, self._rate("acceleration", 7)
-        )
+        start = self.joints
+        target = self._reachable()
+        period = self._spec.period
+        fastest = float(self._spec.joint_velocity_limit.min())
+        speed = min(self._rate("speed", 6), fastest)
+        distance = float(np.abs(target - start).max())
+        duration, done = profile(distance, speed, self._rate("acceleration", 7))
         if not duration < LONGEST_MOVE:
             raise ValueError(f"its move must take less than {LONGEST_MOVE:g} s, got {duration:g} s")
         self.busy = True
@@ -221,31 +235,29 @@ class ControlProgram:
                 if k * period >= duration:
                     if np.abs(target - self.joints).max() < POSITION_TOLERANCE:
                         return
-                    if (
-                        not self._lockstep
-                    ):  # a UR answers at the end of the profile, and its drives follow
+                    # A UR answers at the end of the profile, and its drives follow.
+                    if not self._lockstep:
                         self._arrive()
                 now, then, later = (done((k + ahead) * period) for ahead in range(3))
-                rate = (then - now) / period + (self._drive.lag or 0.0) * (
-                    later - 2.0 * then + now
-                ) / period**2
-                there = start + (target - start) * done(k * period - self._drive.command_delay)
+                acceleration = (later - 2.0 * then + now) / period**2
+                lag = self._drive.lag or 0.0
+                rate = (then - now) / period + lag * acceleration
+                # Where the arm should be by the commands that have acted.
+                share = done(k * period - self._drive.command_delay)
+                there = start + (target - start) * share
                 yield (target - start) * rate + POSITION_GAIN * (there - self.joints)
 
         return along()
 
     def _speed(self) -> Iterator[FloatArray]:
-        limit, wanted = self._spec.joint_velocity_limit, self._numbers(0, self._spec.n)
-        return self._ramp(
-            np.clip(wanted, -limit, limit), self._rate("acceleration", 6), forever=True
-        )
+        limit = self._spec.joint_velocity_limit
+        wanted = np.clip(self._numbers(0, self._spec.n), -limit, limit)
+        return self._ramp(wanted, self._rate("acceleration", 6), forever=True)
 
     def _servo(self) -> Iterator[FloatArray]:
         """Approach a position with the look-ahead time as time constant."""
-        target, time_constant = (
-            self._reachable(),
-            max(self._rate("lookahead_time", 9), self._spec.period),
-        )
+        target = self._reachable()
+        time_constant = max(self._rate("lookahead_time", 9), self._spec.period)
         return ((target - self.joints) / time_constant for _ in count())
 
     def _halt(self) -> Iterator[FloatArray]:

@@ -96,12 +96,14 @@ class Server:
             RunFault: the run cannot begin.
         """
         check_settings(settings, [request.plant, request.task])
-        resolved, self._arm = resolve(request, settings), find_robot(request.robot).arm
+        resolved = resolve(request, settings)
+        self._arm = find_robot(request.robot).arm
         if self._arm.n != 6:
             raise ConfigurationError(
                 f"--robot must be one with 6 joints, as every UR has, got {self._arm.n}"
             )
-        sensing, frames = getattr(resolved.plant, "sensing", None), resolved.run.period
+        sensing = getattr(resolved.plant, "sensing", None)
+        frames = resolved.run.period
         if not lockstep:
             if isinstance(sensing, SensingConfig):
                 frames = sensing.frame_period or frames
@@ -110,26 +112,26 @@ class Server:
             resolved = replace(resolved, run=replace(resolved.run, period=1.0 / RATE))
         experiment = build(resolved)
         check_possible(resolved, experiment.drawn, experiment.plant.spec)
-        self._plant, self._spec = experiment.plant, experiment.plant.spec
+        self._plant = experiment.plant
+        self._spec = experiment.plant.spec
         first = self._plant.reset(named_seed(request.seed, "plant"))
         self.rollout = Rollout(self._plant, first, experiment.desired(), experiment.loop)
-        self._frames, self._say, self._lockstep = (
-            max(1, round(frames / self._spec.period)),
-            say,
-            lockstep,
-        )
+        self._frames = max(1, round(frames / self._spec.period))
+        self._say = say
+        self._lockstep = lockstep
         # For its lag and its command delay
         drive = self._plant.with_delays(TrueModel(lambda q: q, lambda q: q))
         self.program = ControlProgram(self._spec, drive, say, lockstep=lockstep)
         self._clients: set[Client] = set()
         self._watchers: dict[StreamWriter, bool] = {}  # of features, and whether they want pictures
         self._open: dict[str, set[StreamWriter]] = {port: set() for port in PORTS}
-        self._silent: dict[
-            StreamWriter, str
-        ] = {}  # ports of connections that said nothing whole yet, oldest first
+        # Ports of connections that said nothing whole yet, oldest first.
+        self._silent: dict[StreamWriter, str] = {}
         self._crowded: set[str] = set()  # ports at which a connection had to give way
         self._fault: str | None = None
-        self._sent, self._untold, self._turn = 0, 0, asyncio.Event()
+        self._sent = 0
+        self._untold = 0
+        self._turn = asyncio.Event()
         self.state: dict[str, Any] = {
             **wire.CONTROLLER["constant"],
             "actual_digital_output_bits": 0,
@@ -257,30 +259,35 @@ class Server:
 
     def _measure(self) -> None:
         """Take the joints into program and state."""
-        before, now = self.program.joints, self.rollout.observation
-        self.program.joints = now.joint_position
-        flange = self._arm.frames(now.joint_position)[-1]
-        pose = (*flange[:3, 3], *cv2.Rodrigues(flange[:3, :3])[0].ravel())
-        moving = (
-            (now.joint_position - before) / self._spec.period
-            if now.time > 0.0
-            else wire.ZEROS["VECTOR6D"]
-        )
-        self.state |= {
-            "timestamp": now.time, "actual_q": now.joint_position, "target_q": now.joint_position, "actual_qd": moving,
-            "target_qd": self.program.velocity, "actual_TCP_pose": pose, "target_TCP_pose": pose,
-        }  # fmt: skip
+        before = self.program.joints
+        now = self.rollout.observation
+        joints = now.joint_position
+        self.program.joints = joints
+        flange = self._arm.frames(joints)[-1]
+        turn, _ = cv2.Rodrigues(flange[:3, :3])
+        pose = (*flange[:3, 3], *turn.ravel())
+        velocity = (joints - before) / self._spec.period
+        moving = velocity if now.time > 0.0 else wire.ZEROS["VECTOR6D"]
+        self.state["timestamp"] = now.time
+        self.state["actual_q"] = joints
+        self.state["target_q"] = joints
+        self.state["actual_qd"] = moving
+        self.state["target_qd"] = self.program.velocity
+        self.state["actual_TCP_pose"] = pose
+        self.state["target_TCP_pose"] = pose
 
     def _publish(self) -> None:
         """Send the state to every client whose turn it is."""
-        running, stopped = self.program.running, self.program.stopped_at is not None
+        running = self.program.running
+        stopped = self.program.stopped_at is not None
         self.state |= {
             "output_int_register_0": self.program.progress, "runtime_state": 2 if running else 1,
             "robot_status_bits": 3 if running else 1, "safety_status_bits": 4 if stopped else 1,
             "safety_mode": 3 if stopped else 1,
         }  # fmt: skip
         self._turn.set()
-        self._sent, self._turn = self._sent + 1, asyncio.Event()
+        self._sent += 1
+        self._turn = asyncio.Event()
         for each in self._clients:
             each.packets = 0
             due = each.started and (self._lockstep or self._sent % each.every == 0)
@@ -303,20 +310,31 @@ class Server:
             self._clients.discard(own)
 
     def _answer(self, own: Client, kind: str, body: bytes) -> None:
-        """Answer a packet of a client, or raise a `WireError` where its body makes no sense."""
-        answers: dict[str, Callable[[], bytes]] = {
-            "V": lambda: self._negotiate(own, int.from_bytes(body)),
-            "v": lambda: struct.pack(">4I", *wire.CONTROLLER["version"]),
-            "O": lambda: self._subscribe(own, body), "I": lambda: self._admit(own, body), "P": lambda: b"\x01",
-            "S": lambda: bytes([own.outputs is not None]),
-        }  # fmt: skip
+        """Take a packet of a client, or raise a `WireError` where its body makes no sense."""
         if kind == "U":
             self._receive(own, body)
         elif kind == "M":
-            self._say(f"message of a client: {wire.read_message(body, own.version)!r}")
+            message = wire.read_message(body, own.version)
+            self._say(f"message of a client: {message!r}")
         else:
-            own.writer.write(wire.packet(kind, answers[kind]()))
+            answer = self._answer_of(own, kind, body)
+            own.writer.write(wire.packet(kind, answer))
             own.started = kind == "S" or (own.started and kind != "P")
+
+    def _answer_of(self, own: Client, kind: str, body: bytes) -> bytes:
+        """Return the body of the answer to a packet of a client."""
+        match kind:
+            case "V":
+                return self._negotiate(own, int.from_bytes(body))
+            case "v":
+                return struct.pack(">4I", *wire.CONTROLLER["version"])
+            case "O":
+                return self._subscribe(own, body)
+            case "I":
+                return self._admit(own, body)
+            case "S":
+                return bytes([own.outputs is not None])
+        return b"\x01"  # to "P"
 
     def _negotiate(self, own: Client, version: int) -> bytes:
         """Take the version of the protocol that a client wants."""

@@ -99,12 +99,13 @@ class Recipe:
             raise WireError(
                 f"data of {self.names[0]} … must be {self.layout.size} bytes, got {len(body)}"
             )
-        numbers, sizes = iter(self.layout.unpack(body)), (len(ZEROS[kind]) for kind in self.types)
-        taken = (tuple(islice(numbers, size)) for size in sizes)
-        return {
-            name: each if len(each) > 1 else each[0]
-            for name, each in zip(self.names, taken, strict=True)
-        }
+        numbers = iter(self.layout.unpack(body))
+        values: dict[str, Any] = {}
+        for name, kind in zip(self.names, self.types, strict=True):
+            size = len(ZEROS[kind])
+            first, *others = islice(numbers, size)
+            values[name] = (first, *others) if others else first
+        return values
 
 
 def packet(kind: str, body: bytes) -> bytes:
