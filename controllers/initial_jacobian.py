@@ -133,7 +133,8 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         self._move = ceil(in_periods(config.probe_time, spec.period))
         self._settle = ceil(in_periods(config.settle_time, spec.period))
         self._rest = ceil(in_periods(config.average_time, spec.period))
-        self.duration = self._rest + spec.n * (self._move + self._settle + self._rest - 1)
+        periods_a_joint = self._move + self._settle + self._rest - 1
+        self.duration = self._rest + spec.n * periods_a_joint
         self._speed = config.probe_step / (self._move * spec.period)
         slowest = float(spec.joint_velocity_limit.min())
         if self._speed > slowest:
@@ -142,7 +143,8 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
                 f"probe_step must be at most {largest:.6g} rad for probe_time = {config.probe_time:g} s, or a joint "
                 f"exceeds its limit of {slowest:g} rad/s; got {config.probe_step:g} rad"
             )
-        narrowest = float((spec.joint_upper - spec.joint_lower).min())
+        ranges = spec.joint_upper - spec.joint_lower
+        narrowest = float(ranges.min())
         if 2.0 * config.probe_step > narrowest:
             raise ValueError(
                 f"probe_step must be at most half the joint range of {narrowest:g} rad, got {config.probe_step:g}"
@@ -153,15 +155,21 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         lead = observation.feature.shape[:-1]
         n = self._spec.n
         m = self._spec.m
+        none = np.zeros(lead, dtype=np.int_)
+        q = np.zeros((*lead, n))
+        y = np.zeros((*lead, m))
+        rest_positions = np.zeros((*lead, n + 1, n))
+        rest_features = np.zeros((*lead, n + 1, m))
+        settled = np.full(lead, self._settle)  # The arm starts at rest.
         return ProbeState(
-            rests=np.zeros(lead, dtype=np.int_),
-            rest_positions=np.zeros((*lead, n + 1, n)),
-            rest_features=np.zeros((*lead, n + 1, m)),
-            gathered=np.zeros(lead, dtype=np.int_),
-            positions=np.zeros((*lead, n)),
-            features=np.zeros((*lead, m)),
-            phase=np.full(lead, self._settle),  # the arm starts at rest
-            rest_begins=np.zeros(lead, dtype=np.int_),
+            rests=none,
+            rest_positions=rest_positions,
+            rest_features=rest_features,
+            gathered=none,
+            positions=q,
+            features=y,
+            phase=settled,
+            rest_begins=none,
         )
 
     def step(
@@ -188,23 +196,27 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         return state._replace(phase=state.phase + 1), velocity, done
 
     def _gather(self, state: ProbeState, observation: Observation) -> ProbeState:
-        return state._replace(
-            positions=state.positions + observation.joint_position,
-            features=state.features + observation.feature,
-            gathered=state.gathered + 1,
-        )
+        q = state.positions + observation.joint_position
+        y = state.features + observation.feature
+        return state._replace(positions=q, features=y, gathered=state.gathered + 1)
 
     def _end_rest(self, state: ProbeState) -> ProbeState:
         """Return the state in which the present rest is over and its means are kept."""
         zero = np.zeros_like(state.phase)
         count = np.asarray(state.gathered)[..., None]
+        q = state.positions / count
+        y = state.features / count
+        rest_positions = _with_entry(state.rest_positions, state.rests, q)
+        rest_features = _with_entry(state.rest_features, state.rests, y)
+        no_position = np.zeros_like(q)
+        no_feature = np.zeros_like(y)
         return state._replace(
-            rest_positions=_with_entry(state.rest_positions, state.rests, state.positions / count),
-            rest_features=_with_entry(state.rest_features, state.rests, state.features / count),
+            rest_positions=rest_positions,
+            rest_features=rest_features,
             rests=state.rests + 1,
             gathered=zero,
-            positions=np.zeros_like(state.positions),
-            features=np.zeros_like(state.features),
+            positions=no_position,
+            features=no_feature,
             phase=zero,
             rest_begins=zero + self._move,
         )
@@ -228,7 +240,8 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
 
 def _with_entry(rows: FloatArray, index: IntArray, row: FloatArray) -> FloatArray:
     """Return rows (..., k, n) in which row `index`, (...), is `row`, (..., n)."""
-    chosen = np.arange(rows.shape[-2]) == np.asarray(index)[..., None]
+    places = np.arange(rows.shape[-2])
+    chosen = places == np.asarray(index)[..., None]
     return np.where(chosen[..., None], row[..., None, :], rows)
 
 

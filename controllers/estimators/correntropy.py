@@ -37,7 +37,8 @@ MIN_ERROR: Final = 0.1  # [1] smallest |e| of the generalised kernel, in standar
 
 def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
     """Return G(e) = exp(−e²/(2b²)), from exp(−`MAX_EXPONENT`) to 1, for normalised errors of any shape."""
-    return np.exp(-np.minimum(error * error / (2.0 * bandwidth**2), MAX_EXPONENT))
+    exponent = error * error / (2.0 * bandwidth**2)
+    return np.exp(-np.minimum(exponent, MAX_EXPONENT))
 
 
 def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> FloatArray:
@@ -160,10 +161,12 @@ def fixed_point_update(
     def improved(tree: Iteration) -> Iteration:
         at = tree.at
         J, B, h, dq, dy, r = tree.given
-        error = (dy - np.matvec(at.J, dq)) / np.sqrt(r)[..., None]
+        sigma = np.sqrt(r)[..., None]
+        error = (dy - np.matvec(at.J, dq)) / sigma
         spread = h / weight(at.prior)
         w = weight(error)
-        share = w / (w * np.vecdot(h, spread) + r[..., None])
+        variance = w * np.vecdot(h, spread) + r[..., None]
+        share = w / variance
         gain = share[..., None] * np.matvec(B, spread)
         nu = dy - np.matvec(J, dq)
         new = J + nu[..., None] * gain
@@ -173,7 +176,9 @@ def fixed_point_update(
         moves = change > config.tolerance * norm(_flat(at.J))
         return Iteration(Iterate(new, gain, prior, moves), tree.given)
 
-    first = Iterate(J, np.zeros_like(J), np.zeros_like(J), np.ones_like(r, dtype=np.bool_)[()])
+    none = np.zeros_like(J)
+    moves = np.ones_like(r, dtype=np.bool_)[()]
+    first = Iterate(J, none, none, moves)
     last = repeat(_moves, improved, Iteration(first, given), config.iterations)
     return corrected(J, P, last.at.gain, joint_step, feature_step, r=r)
 
@@ -244,9 +249,12 @@ def imcckf_update(
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
-    weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)
+    size = norm(innovation) / np.sqrt(r)
+    weight = gaussian_weight(size, bandwidth)
     PH, gain = weighted_gain(P, joint_step, weight[..., None], r)
-    return J + innovation[..., None] * gain, symmetric(P - outer(gain, PH))
+    J = J + innovation[..., None] * gain
+    P = P - outer(gain, PH)
+    return J, symmetric(P)
 
 
 def imcckf_estimator(

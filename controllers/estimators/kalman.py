@@ -101,7 +101,8 @@ def joseph(
     With A = P − K PHᵀ it is multiplied out: A − (A Δq) Kᵀ + r K Kᵀ.
     """
     A = P - outer(K, PH)
-    return np.asarray(A + outer(r[..., None] * K - np.matvec(A, joint_step), K))
+    column = r[..., None] * K - np.matvec(A, joint_step)
+    return np.asarray(A + outer(column, K))
 
 
 def symmetric(P: FloatArray) -> FloatArray:
@@ -126,13 +127,16 @@ def kalman_update(
     """
     *lead, m, n = J.shape
     x = J.reshape(*lead, m * n)
-    H = (np.eye(m)[..., None] * joint_step[..., None, None, :]).reshape(*lead, m, m * n)
+    blocks = np.eye(m)[..., None] * joint_step[..., None, None, :]
+    H = blocks.reshape(*lead, m, m * n)
     R = r[..., None, None] * np.eye(m)
     HP = H @ P
-    K = np.linalg.solve(HP @ H.mT + R, HP).mT
+    S = HP @ H.mT + R
+    K = np.linalg.solve(S, HP).mT
     A = np.eye(m * n) - K @ H
     P = A @ P @ A.mT + K @ R @ K.mT
-    x = x + np.matvec(K, feature_step - np.matvec(H, x))
+    nu = feature_step - np.matvec(H, x)
+    x = x + np.matvec(K, nu)
     return x.reshape(J.shape), symmetric(P)
 
 
@@ -284,7 +288,8 @@ def unscented_update(
     size = m * n
     weights = sigma_weights(size, config.alpha, config.beta, config.kappa)
     reach = weights.reach * cholesky_of(P).mT
-    offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
+    centre = np.zeros((*lead, 1, size))
+    offsets = np.concatenate([centre, reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
     # Each point is m rows of J.
     jacobians = points.reshape(*lead, 2 * size + 1, m, n)
@@ -292,12 +297,14 @@ def unscented_update(
     z = np.vecmat(weights.mean, Z)
     deviations = Z - z[..., None, :]
     weighted = weights.covariance[:, None] * deviations
-    S = deviations.mT @ weighted + r[..., None, None] * np.eye(m)
+    R = r[..., None, None] * np.eye(m)
+    S = deviations.mT @ weighted + R
     C = offsets.mT @ weighted
     K = np.linalg.solve(S, C.mT).mT
     # K S Kᵀ = K Cᵀ, as K S = C.
     P = P - K @ C.mT
-    return J + np.matvec(K, feature_step - z).reshape(J.shape), symmetric(P)
+    change = np.matvec(K, feature_step - z)
+    return J + change.reshape(J.shape), symmetric(P)
 
 
 def ukf_estimator(
@@ -357,9 +364,11 @@ def rls_update(
         The new Jacobian and P.
     """
     PH = np.matvec(P, joint_step)
-    K = PH / (forgetting + np.vecdot(joint_step, PH))[..., None]
+    s = forgetting + np.vecdot(joint_step, PH)
+    K = PH / s[..., None]
     P = joseph(P, PH, K, joint_step, forgetting) / forgetting[..., None, None]
-    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(P)
+    nu = feature_step - np.matvec(J, joint_step)
+    return J + outer(nu, K), symmetric(P)
 
 
 @final
@@ -375,7 +384,8 @@ class RlsEstimator(GatedEstimator[WalkState]):
     def start(self, jacobian: FloatArray) -> WalkState:
         """Start from Ĵ₀, (..., m, n), m/rad, with P (..., n, n), 1/rad²."""
         *lead, _, n = jacobian.shape
-        P = np.broadcast_to(np.eye(n) * self._config.initial_covariance, (*lead, n, n))
+        P = np.eye(n) * self._config.initial_covariance
+        P = np.broadcast_to(P, (*lead, n, n))
         return WalkState(jacobian, P, np.full(lead, False))
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:

@@ -169,16 +169,16 @@ class RbfEstimator(NetworkEstimator[RbfState]):
         """Start from the offline network, without regard to Ĵ₀."""
         lead = jacobian.shape[:-2]
         window = self._config.window
-        layers, units = self._network.layers
-        return RbfState(
-            rows=self._started(jacobian),
-            theta=np.zeros((*lead, window - 1, layers, units)),
-            joint_steps=np.zeros((*lead, window - 1, self._network.n)),
-            feature_steps=np.zeros((*lead, window - 1, self._network.m)),
-            filled=np.zeros(lead, dtype=np.int_),
-            errors=np.zeros((*lead, window, self._network.m)),
-            step=np.zeros(lead),
-        )
+        network = self._network
+        before = (*lead, window - 1)
+        theta = np.zeros((*before, *network.layers))
+        joint_steps = np.zeros((*before, network.n))
+        feature_steps = np.zeros((*before, network.m))
+        filled = np.zeros(lead, dtype=np.int_)
+        errors = np.zeros((*lead, window, network.m))
+        step = np.zeros(lead)
+        rows = self._started(jacobian)
+        return RbfState(rows, theta, joint_steps, feature_steps, filled, errors, step)
 
     def update(self, state: RbfState, motion: Motion) -> RbfState:
         """Learn from the window that `motion` completes."""
@@ -188,17 +188,19 @@ class RbfEstimator(NetworkEstimator[RbfState]):
         if motion.noise is not None:
             ratio = motion.noise / REFERENCE_NOISE
             epsilon = epsilon * (ratio * ratio)
-        newest = self.features(motion.joint_position)
-        theta = np.concatenate([state.theta, newest[..., None, :, :]], axis=-3)
-        joint_steps = np.concatenate([state.joint_steps, motion.joint_step[..., None, :]], axis=-2)
-        feature_steps = np.concatenate(
-            [state.feature_steps, motion.feature_step[..., None, :]], axis=-2
-        )
-        errors = feature_steps - np.matvec(network.output(state.rows, theta), joint_steps)
+        theta_t = self.features(motion.joint_position)[..., None, :, :]
+        dq_t = motion.joint_step[..., None, :]
+        dy_t = motion.feature_step[..., None, :]
+        theta = np.concatenate([state.theta, theta_t], axis=-3)
+        joint_steps = np.concatenate([state.joint_steps, dq_t], axis=-2)
+        feature_steps = np.concatenate([state.feature_steps, dy_t], axis=-2)
+        jacobians = network.output(state.rows, theta)
+        errors = feature_steps - np.matvec(jacobians, joint_steps)
         filled = np.minimum(state.filled + 1, config.window)
         sizes = np.vecdot(theta, theta).take(network.layer_of, axis=-1)
         step = window_step(sizes, joint_steps, filled, config.k2, epsilon)
-        rows = network.gradient(step[..., None, None] * errors, joint_steps, theta)
+        scaled = step[..., None, None] * errors
+        rows = network.gradient(scaled, joint_steps, theta)
         np.add(rows, state.rows, out=rows)
         if config.leak:
             gone = -np.expm1(-config.leak * motion.duration)
@@ -215,10 +217,13 @@ class RbfEstimator(NetworkEstimator[RbfState]):
 
     def diagnostics(self, state: RbfState) -> Diagnostics:
         """Return the step size α₂, the root of Q, the window's prediction error (m), and the norm of all weights."""
+        lead = state.step.shape
+        errors = state.errors.reshape(*lead, -1)
+        weights = state.rows.reshape(*lead, -1)
         return {
             "estimator_step_size": state.step,
-            "window_error": norm(state.errors.reshape(*state.step.shape, -1)),
-            "estimator_weight_norm": norm(state.rows.reshape(*state.step.shape, -1)),
+            "window_error": norm(errors),
+            "estimator_weight_norm": norm(weights),
         }
 
 

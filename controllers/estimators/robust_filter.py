@@ -119,22 +119,28 @@ class RobustEstimator(Estimator[RobustState]):
         column = P[..., 0]
         variance = column[..., 0]
         sigma_s = sigma * state.scale
-        noise = (sigma_s * sigma_s)[..., None] * np.ones_like(innovation)
+        square = sigma_s * sigma_s
+        noise = square[..., None] * np.ones_like(innovation)
         weight = irls_weight(innovation, variance, noise)
-        gain = weight[..., None] * column / (weight * variance + noise)[..., None]
+        total = weight * variance + noise
+        gain = weight[..., None] * column / total[..., None]
         J = state.J + innovation[..., None] * gain[..., 1:]
         P = P - outer(gain, column)
         deviation = innovation * (1.0 - gain[..., 0])
 
         keep = np.exp(-duration / MEMORY)[..., None]
-        rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTION_WEIGHT)
+        is_rejected = weight < REJECTION_WEIGHT
+        rejected = keep * state.rejected + (1.0 - keep) * is_rejected
         lost = rejected > LOST_SHARE
-        P = where(lost, _restarted_at_frame(P, noise), (P + P.mT) / 2)
+        restarted = _restarted_at_frame(P, noise)
+        P = where(lost, restarted, (P + P.mT) / 2)
 
         # The scale rises with each innovation above the normal median, and sinks with each below.
         median = NORMAL_MEDIAN * np.sqrt(variance + noise)
-        excess = np.sign(np.abs(innovation) - median).mean(axis=-1)
-        scale = np.clip(state.scale * np.exp(SCALE_RATE * duration * excess), 1.0, MAX_SCALE)
+        above = np.sign(np.abs(innovation) - median)
+        excess = above.mean(axis=-1)
+        factor = np.exp(SCALE_RATE * duration * excess)
+        scale = np.clip(state.scale * factor, 1.0, MAX_SCALE)
         none = np.zeros_like(innovation)
         return RobustState(
             J=J,
@@ -150,18 +156,23 @@ class RobustEstimator(Estimator[RobustState]):
         """Return the covariance after a motion: F P Fᵀ + Q with F = [[1, Δqᵀ], [0, I]]."""
         config = self._config
         n = joint_step.shape[-1]
-        F = np.broadcast_to(np.eye(n + 1), (*joint_step.shape[:-1], n + 1, n + 1)).copy()
+        identity = np.eye(n + 1)
+        F = np.broadcast_to(identity, (*joint_step.shape[:-1], n + 1, n + 1)).copy()
         F[..., 0, 1:] = joint_step
         F = F[..., None, :, :]
         moves = norm(joint_step) >= config.min_joint_step
         walk = np.where(moves, config.walk**2 * duration, 0.0)
         Q = np.broadcast_to(walk[..., None, None], (*predicted.shape, n + 1)).copy()
-        Q[..., 0] = (config.motion_error * norm(predicted)[..., None]) ** 2
-        return F @ P @ F.mT + Q[..., None] * np.eye(n + 1)
+        length = norm(predicted)[..., None]
+        Q[..., 0] = (config.motion_error * length) ** 2
+        propagated = F @ P @ F.mT
+        return propagated + Q[..., None] * identity
 
     def diagnostics(self, state: RobustState) -> Diagnostics:
         """Return the scale of the noise, the share of rejected frames and the mean deviation of J's entries, m/rad."""
-        variance = np.diagonal(state.P, axis1=-2, axis2=-1)[..., 1:].mean(axis=-1).mean(axis=-1)
+        diagonal = np.diagonal(state.P, axis1=-2, axis2=-1)
+        of_entries = diagonal[..., 1:]
+        variance = of_entries.mean(axis=-1).mean(axis=-1)
         return {
             "noise_scale": state.scale,
             "rejected_share": state.rejected.mean(axis=-1),

@@ -111,9 +111,11 @@ def _shift(m: int, n: int, error_history: int, position_history: int) -> FloatAr
 
 def _push_entries(A: FloatArray, begin: int, end: int, size: int, added: int) -> None:
     """Fill the rows of a history from `begin` to `end`, `size` entries each, whose newest grows by those at `added`."""
-    A[begin : begin + size, begin : begin + size] = np.eye(size)
-    A[begin : begin + size, added : added + size] = np.eye(size)
-    A[begin + size : end, begin : end - size] = np.eye(end - begin - size)
+    newest = slice(begin, begin + size)
+    older = slice(begin + size, end)
+    A[newest, newest] = np.eye(size)
+    A[newest, added : added + size] = np.eye(size)
+    A[older, begin : end - size] = np.eye(end - begin - size)
 
 
 def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:
@@ -240,13 +242,12 @@ class RbfnnLaw(Law[RbfnnState]):
         network = self._network
         lead = observation.feature.shape[:-1]
         q = observation.joint_position
-        return RbfnnState(
-            learned=np.zeros((*lead, *network.weights.shape)),
-            errors=np.full((*lead, self._error_rows, network.m), np.nan),
-            positions=np.repeat(q[..., None, :], self._position_rows, axis=-2),
-            predicted=np.zeros((*lead, self._config.horizon, network.m)),
-            step_size=np.zeros(lead),
-        )
+        learned = np.zeros((*lead, *network.weights.shape))
+        unknown = np.full((*lead, self._error_rows, network.m), np.nan)
+        positions = np.repeat(q[..., None, :], self._position_rows, axis=-2)
+        predicted = np.zeros((*lead, self._config.horizon, network.m))
+        step_size = np.zeros(lead)
+        return RbfnnState(learned, unknown, positions, predicted, step_size)
 
     def command(
         self, state: RbfnnState, estimate: Estimate, observation: Observation, reference: FloatArray
@@ -289,12 +290,15 @@ class RbfnnLaw(Law[RbfnnState]):
     def diagnostics(self, state: RbfnnState) -> Diagnostics:
         """Return I_c = ½ Σ ‖e(k+t)‖² (eq. 15, m²), step size α, ‖e(k+T)‖ (m), norms of weights."""
         weights = self._network.weights + state.learned
+        weight_square = sum_of_squares(weights, 3)
+        learned_square = sum_of_squares(state.learned, 3)
+        last = state.predicted[..., -1, :]
         return {
             "criterion": 0.5 * sum_of_squares(state.predicted, 2),
             "step_size": state.step_size,
-            "predicted_error": norm(state.predicted[..., -1, :]),
-            "controller_weight_norm": np.sqrt(sum_of_squares(weights, 3)),
-            "learned_weight_norm": np.sqrt(sum_of_squares(state.learned, 3)),
+            "predicted_error": norm(last),
+            "controller_weight_norm": np.sqrt(weight_square),
+            "learned_weight_norm": np.sqrt(learned_square),
         }
 
     def _filled(self, errors: FloatArray) -> FloatArray:

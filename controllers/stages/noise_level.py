@@ -73,11 +73,15 @@ def _learned(
     a = (multiple * level.guess)[..., None]
     b = np.maximum(other, 0.0)[..., None]
     K = count[..., None]
-    s = a * np.exp(2.0 * LOG_RATIOS) + b
+    ratios = np.exp(2.0 * LOG_RATIOS)
+    s = a * ratios + b
     inlier = square[..., None] / s + K * np.log(s)
     outlier = K * np.log(OUTLIER**2) + OUTLIER_ODDS
     scores = FORGETTING * level.scores + np.minimum(inlier, outlier)
-    scores = scores - np.minimum.reduce(scores, axis=-1)[..., None]
+    least = np.minimum.reduce(scores, axis=-1)
+    scores = scores - least[..., None]
     likelihood = np.exp(np.maximum(-0.5 * scores, MIN_LOG_LIKELIHOOD))
-    log_ratio = np.vecdot(likelihood, LOG_RATIOS) / np.add.reduce(likelihood, axis=-1)
-    return level._replace(variance=level.guess * np.exp(2.0 * log_ratio), scores=scores)
+    total = np.add.reduce(likelihood, axis=-1)
+    log_ratio = np.vecdot(likelihood, LOG_RATIOS) / total
+    variance = level.guess * np.exp(2.0 * log_ratio)
+    return level._replace(variance=variance, scores=scores)

@@ -257,8 +257,11 @@ class Pairing:
         lead = observation.feature.shape[:-1]
         m = self._m
         frame = self._aids.feature_noise**2
-        row = np.concatenate([q, np.zeros((*lead, m))], axis=-1)
-        bank = fresh_bank(np.eye(m, m + self._n), self._variances, frame)
+        no_motion = np.zeros((*lead, m))
+        row = np.concatenate([q, no_motion], axis=-1)
+        past = np.repeat(row[..., None, :], self._rows, axis=-2)
+        nominal_map = np.eye(m, m + self._n)
+        bank = fresh_bank(nominal_map, self._variances, frame)
         count = len(self.delays)
         known = Identified(
             bank=np.broadcast_to(bank, (*lead, count, *bank.shape)),
@@ -266,14 +269,10 @@ class Pairing:
             candidate=np.zeros(lead, dtype=np.int_)[()],
             regression=self.regression.start(lead, frame),
         )
-        return PairState(
-            past=np.repeat(row[..., None, :], self._rows, axis=-2),
-            base=base,
-            noise=NoiseLevel.start(self._aids.feature_noise, lead),
-            nis=np.zeros(lead)[()],
-            anchor=Anchor.at_last_frame(known, m),
-            **known._asdict(),
-        )
+        noise = NoiseLevel.start(self._aids.feature_noise, lead)
+        anchor = Anchor.at_last_frame(known, m)
+        nis = np.zeros(lead)[()]
+        return PairState(past, base, noise=noise, nis=nis, anchor=anchor, **known._asdict())
 
     def advance(self, state: PairState, joint_position: FloatArray, base: FloatArray) -> PairState:
         """Return the state one period later, with the arm at `joint_position` (..., n), rad, and J_n there."""
@@ -299,13 +298,10 @@ class Pairing:
         exposed = rows[..., 0, :]
         before = exposed - rows[..., 1, :]
         since = state.past[..., 0, :] - exposed
-        return Past(
-            exposed=exposed[..., :n],
-            before=before[..., :n],
-            predicted=(before[..., n:], since[..., n:]),
-            window=joint_position - state.past[..., window, :n],
-            noise=state.regression.mean[..., -1],
-        )
+        predicted = (before[..., n:], since[..., n:])
+        step = joint_position - state.past[..., window, :n]
+        noise = state.regression.mean[..., -1]
+        return Past(exposed[..., :n], before[..., :n], predicted, step, noise)
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""
@@ -333,7 +329,8 @@ class Pairing:
             valid=anchor.valid & valid,
         )
         end = self._candidates.ends(state.past)
-        begin_since = self._candidates.begins(state.past, since.duration / self._period)
+        periods_since = since.duration / self._period
+        begin_since = self._candidates.begins(state.past, periods_since)
 
         # A frame is taken back if the motion past it, from the anchor, fits much better than the motion to it. Its miss
         # is that of the delay that was known at the anchor.
@@ -348,18 +345,19 @@ class Pairing:
 
         # Where the anchor is the last frame, the motion since the anchor is the last motion, and its begin is known.
         shorter = (anchor.miss > 0.0) & ~back
-        begin = branch(
-            shorter, self._begins_instead, begin_since, state.past, duration / self._period
-        )
+        periods = duration / self._period
+        begin = branch(shorter, self._begins_instead, begin_since, state.past, periods)
         state, paired = self._learned(state, motion, begin, end, back)
         state = state.anchored()
 
         # A frame is doubtful if no delay explains the motion from the anchor to it. The least miss over all delays is
         # only found where the miss of the known delay is large already.
         least = DOUBT_GATE * state.noise.variance
-        suspect = ~back & (since.duration < self._longest_doubtful) & (miss > least)
+        recent = since.duration < self._longest_doubtful
+        suspect = ~back & recent & (miss > least)
         miss = branch(suspect, self._least_miss_instead, miss, since, begin_since, end)
-        anchor = choose(suspect & (miss > least), since._replace(miss=miss), state.anchor)
+        doubtful = suspect & (miss > least)
+        anchor = choose(doubtful, since._replace(miss=miss), state.anchor)
         return state._replace(anchor=anchor), paired
 
     def _learned(
@@ -375,7 +373,8 @@ class Pairing:
         passed = end - begin
         h = np.concatenate([passed[..., n:], passed[..., :n]], axis=-1)
         now = pick(state.bank, state.candidate)[..., : self._m, :]
-        foreseen = np.matvec(now[..., :-1], pick(h, state.candidate)) - now[..., -1]
+        motion_now = np.matvec(now[..., :-1], pick(h, state.candidate))
+        foreseen = motion_now - now[..., -1]
         dy = np.where(motion.valid, motion.feature_step, foreseen)
         state = self._find_delay(state, h, dy, motion.valid)
 
@@ -390,7 +389,8 @@ class Pairing:
 
         foreseen = self.regression.explained(before, h) - before.mean[..., -1]
         dy = np.where(motion.valid, motion.feature_step, foreseen)
-        regression = self.regression.update(before, h, dy, motion.duration, state.noise.variance)
+        frame = state.noise.variance
+        regression = self.regression.update(before, h, dy, motion.duration, frame)
         moved = regression.moves > before.moves
         state = branch(moved, self._forget, state._replace(regression=regression))
         return state, paired
@@ -416,8 +416,10 @@ class Pairing:
         E = W[..., m:-1]
         e = W[..., -1]
         foreseen = np.matvec(M, x) + np.matvec(E, dq) - e
-        nu = np.where(since.valid[..., None, :], since.step[..., None, :] - foreseen, 0.0)
-        return np.asarray(np.minimum.reduce(np.vecdot(nu, nu), axis=-1))
+        missed = since.step[..., None, :] - foreseen
+        nu = np.where(since.valid[..., None, :], missed, 0.0)
+        square = np.vecdot(nu, nu)
+        return np.asarray(np.minimum.reduce(square, axis=-1))
 
     def interrupt(self, state: PairState) -> PairState:
         """Return the state after a frame at which no motion ended, without information about its noise."""
@@ -430,15 +432,18 @@ class Pairing:
         regression = state.regression
         R = regression.rotation
         # ‖R − I‖² = 4 (1 − cos φ) for a rotation by φ about one axis.
-        turned = (R - np.eye(self._m)).reshape(*R.shape[:-2], -1)
+        difference = R - np.eye(self._m)
+        turned = difference.reshape(*R.shape[:-2], -1)
         cosine = 1.0 - 0.25 * np.vecdot(turned, turned)
+        angle = np.arccos(np.maximum(cosine, -1.0))
+        deviation = self.regression.deviation(regression)
         return {
             "delay": self.delay(state) * self._period,
             "noise_level": state.noise.deviation,
             "model_surprise": state.nis,
             "camera_moves": regression.moves,
-            "map_rotation": np.arccos(np.maximum(cosine, -1.0)),
-            "model_deviation": self.regression.deviation(regression),
+            "map_rotation": angle,
+            "model_deviation": deviation,
         }
 
     def _forget(self, state: PairState) -> PairState:
@@ -455,7 +460,9 @@ class Pairing:
         frame = state.noise.variance
         lengths = norm(h[..., :m])
         turns = norm(h[..., m:])
-        walks = np.stack([MAP_LENGTH_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1)
+        map_walk = MAP_LENGTH_WALK**2 * lengths
+        rest_walk = REST_WALK**2 * turns
+        walks = np.stack([map_walk, rest_walk], axis=-1)
         walk = np.repeat(walks, (m, self._n), axis=-1)
         unexplained = UNEXPLAINED_SHARE**2 * (lengths * lengths)
         learns = lengths * lengths >= frame[..., None]
@@ -469,18 +476,15 @@ class Pairing:
             noise = noise.learn(now.square, count, now.frames, rest)
 
         counts = self._is_informative(h, lengths, noise)[..., None]
-        evidence = innovations.square / innovations.capped + m * np.log(innovations.capped)
+        capped = innovations.capped
+        evidence = innovations.square / capped + m * np.log(capped)
         scores = self._aids.score_memory * state.scores + evidence * counts
         best = scores.argmin(axis=-1)
         present = pick(scores, state.candidate)
         better = pick(scores, best) < present - self._aids.delay_margin
-        return state._replace(
-            bank=bank,
-            scores=scores,
-            noise=noise,
-            candidate=np.where(better, best, state.candidate)[()],
-            nis=now.square / (now.variance * np.maximum(count, 1)),
-        )
+        candidate = np.where(better, best, state.candidate)[()]
+        nis = now.square / (now.variance * np.maximum(count, 1))
+        return state._replace(bank=bank, scores=scores, noise=noise, candidate=candidate, nis=nis)
 
     def _is_informative(self, h: FloatArray, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
         """Return whether a motion counts in the scores, (...).

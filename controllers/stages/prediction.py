@@ -88,16 +88,11 @@ class JointResponse(NamedTuple):
         growth = np.exp(PRIOR_GROWTH * period * np.arange(length))
         weights = PRIOR_WEIGHT * window**2 * period * growth
         first = np.broadcast_to(np.eye(length)[0], (*lead, length))
-        state = cls(
-            A=np.broadcast_to(np.diag(weights), (*lead, length, length)),
-            b=weights[0] * first,
-            commands=np.zeros((*lead, length + window - 1, n)),
-            response=first,
-            left=first,
-            lead=np.zeros(lead),
-            window=window,
-            period=period,
-        )
+        A = np.broadcast_to(np.diag(weights), (*lead, length, length))
+        b = weights[0] * first
+        commands = np.zeros((*lead, length + window - 1, n))
+        none = np.zeros(lead)
+        state = cls(A, b, commands, first, first, none, window, period)
         return with_response(state, first)
 
     @classmethod
@@ -118,13 +113,15 @@ class JointResponse(NamedTuple):
         left = np.broadcast_to(share, (*lead, length))
         arrival = np.add.reduce(left, axis=-1)
         nothing = np.zeros((*lead, 0))
+        commands = np.zeros((*lead, length, n))
+        arrivals = np.full(tuple(lead), arrival)[()]
         return cls(
             A=nothing[..., None],
             b=nothing,
-            commands=np.zeros((*lead, length, n)),
+            commands=commands,
             response=nothing,
             left=left,
-            lead=np.full(tuple(lead), arrival)[()],
+            lead=arrivals,
             window=1,
             period=period,
         )
@@ -142,7 +139,8 @@ class JointResponse(NamedTuple):
 
     def flight(self) -> FloatArray:
         """Return the joint motion (..., n), rad, that is still to come of the commands so far."""
-        return np.asarray(np.vecmat(self.left, self.commands[..., : self.left.shape[-1], :]))
+        last = self.commands[..., : self.left.shape[-1], :]
+        return np.asarray(np.vecmat(self.left, last))
 
     def _steps(self) -> FloatArray:
         """Return the commanded steps of the windows that end 1 … N periods ago, (..., N, n), rad."""
@@ -161,7 +159,8 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
     A = state.A + weight * (steps @ steps.mT)
     b = state.b + weight * np.matvec(steps, joint_step)
     most = MAX_EXCITATION * state.window**2 * state.period
-    kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]
+    excitation = A.trace(axis1=-2, axis2=-1)
+    kept = np.minimum(1.0, most / excitation)[..., None]
     A = kept[..., None] * A
     b = kept * b
     response = np.linalg.solve(A, b[..., None])[..., 0]
@@ -173,12 +172,14 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
 
 def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
     """Return the state with another response g, (..., N), and with the quantities derived from it."""
-    ahead = response[..., ::-1].cumsum(axis=-1)[..., ::-1]  # g_i + … + g_N
+    backwards = response[..., ::-1].cumsum(axis=-1)
+    ahead = backwards[..., ::-1]  # g_i + … + g_N
     left = np.zeros_like(ahead)
     left[..., :-1] = ahead[..., 1:]
     total = ahead[..., 0]
+    known = total > MIN_TOTAL_RESPONSE
     lead = np.add.reduce(left, axis=-1) / np.maximum(total, MIN_TOTAL_RESPONSE)
-    lead = np.minimum(lead, response.shape[-1]) * (total > MIN_TOTAL_RESPONSE)
+    lead = np.minimum(lead, response.shape[-1]) * known
     return state._replace(response=response, left=left, lead=lead)
 
 
@@ -291,10 +292,10 @@ class Predictor:
 
         # From the exposure the arm moved to q, and will move on to `bound`, along which J_n is the mean of both ends.
         J, nominal = stages.ahead(estimation, bound)
-        flight = 0.5 * np.matvec(estimation.learned.pair.base + nominal, bound - q)
-        feature = z + stages.motion(
-            estimation, past.exposed, bound - past.exposed, past.predicted[1] + flight
-        )
+        both = estimation.learned.pair.base + nominal
+        flight = 0.5 * np.matvec(both, bound - q)
+        predicted = past.predicted[1] + flight
+        feature = z + stages.motion(estimation, past.exposed, bound - past.exposed, predicted)
         return PredictorState(response, z), observation.with_values(bound, feature), lead, J
 
     def _filtered(
@@ -341,8 +342,11 @@ def _interpolated(now: FloatArray, reference: FloatArray, lead: FloatArray) -> F
     """Return y_0 + Σ_j s_j (y_{j+1} − y_j), (..., rows, m), with s_j the share of segment j that has passed."""
     rows = np.arange(now.shape[-2])
     segments = np.arange(reference.shape[-2] - 1)
-    s = lead[..., None, None] + (rows[:, None] - segments)
+    beyond = rows[:, None] - segments
+    s = lead[..., None, None] + beyond
     # The last segment goes on beyond the end of the reference.
     s[..., :-1] = np.minimum(s[..., :-1], 1.0)
+    s = np.maximum(s, 0.0)
     steps = reference[..., 1:, :] - reference[..., :-1, :]
-    return np.asarray(reference[..., :1, :] + np.maximum(s, 0.0) @ steps)
+    first = reference[..., :1, :]
+    return np.asarray(first + s @ steps)

@@ -130,7 +130,8 @@ def learn(
     m = feature_step.shape[-1]
     K = h.shape[-1] + 1
     walked = walk * h
-    h = np.concatenate([h, np.full((*h.shape[:-1], 1), -1.0)], axis=-1)
+    of_noise = np.full((*h.shape[:-1], 1), -1.0)
+    h = np.concatenate([h, of_noise], axis=-1)
 
     # One product with h gives W h above P h; less Δy, it is −ν above P h. The change of the bank is minus its products
     # with the gain.
@@ -145,8 +146,10 @@ def learn(
     noise = frame[..., None] + (capped - s)
     share = noise / capped
     # An infinite variance leaves W as it is. The last column, for e, is not used: the column of the new e replaces it.
-    gain = Ph / np.where(learns, capped, np.inf)[..., None]
-    frames = 1.0 + np.minimum(bank[..., -1, -1] / frame[..., None], 1.0)
+    variance = np.where(learns, capped, np.inf)
+    gain = Ph / variance[..., None]
+    last_noise = bank[..., -1, -1]
+    frames = 1.0 + np.minimum(last_noise / frame[..., None], 1.0)
     noisy = -share[..., None] * known
     noisy[..., -1] = noise * (1.0 - share)
 
@@ -216,26 +219,33 @@ class Regression:
         arm = n + len(self._pairs[0])
         self._map = slice(arm, arm + m)
         arm_variances = np.repeat(DEVIATIONS[:, None] ** 2, arm, axis=1)
+        map_variances = np.ones((len(DEVIATIONS), m))
+        arm_walks = WALK[:, None] ** 2 * arm_variances
         map_walks = np.repeat(MAP_TURN_WALKS[:, None] ** 2, m, axis=1)
-        self._P0 = np.concatenate([arm_variances, np.ones((len(DEVIATIONS), m))], axis=1)
-        self._walk = np.concatenate([WALK[:, None] ** 2 * arm_variances, map_walks], axis=1)
+        self._P0 = np.concatenate([arm_variances, map_variances], axis=1)
+        self._walk = np.concatenate([arm_walks, map_walks], axis=1)
 
     def start(self, lead: tuple[int, ...], frame: float) -> RegressionState:
         """Return the state of the nominal model, for the variance σ² of a frame, m²."""
         m = self._m
         W = np.zeros((m, self._map.stop))
         W[:, self._map] = np.eye(m)
-        bank = fresh_bank(np.broadcast_to(W, (len(PRIOR), *W.shape)), self._P0, frame)
+        filters = np.broadcast_to(W, (len(PRIOR), *W.shape))
+        bank = fresh_bank(filters, self._P0, frame)
         mean = np.concatenate([W, np.zeros((m, 1))], axis=1)
+        identity = np.eye(m)
         near = (*lead, len(ROTATION_DEVIATIONS), m, m)
+        rotation = np.broadcast_to(identity, (*lead, m, m))
+        rotations = np.broadcast_to(identity, near)
+        scores = np.broadcast_to(PRIOR, (*lead, len(PRIOR)))
         none = np.zeros(lead, dtype=np.int_)[()]
         return RegressionState(
             bank=np.broadcast_to(bank, (*lead, *bank.shape)),
-            scores=np.broadcast_to(PRIOR, (*lead, len(PRIOR))),
+            scores=scores,
             mean=np.broadcast_to(mean, (*lead, *mean.shape)),
             share=np.zeros(lead)[()],
-            rotation=np.broadcast_to(np.eye(m), (*lead, m, m)),
-            rotations=np.broadcast_to(np.eye(m), near),
+            rotation=rotation,
+            rotations=rotations,
             excess=np.zeros(near),
             streak=none,
             moves=none,
@@ -269,15 +279,18 @@ class Regression:
         joint_step = h[..., : self._n]
         square = np.vecdot(joint_step, joint_step)
         moved = square >= MIN_MOTION**2
-        walk = (np.sqrt(square) * moved)[..., None, None] * self._walk
-        model = REST_DRIFT**2 * duration[..., None] + MODEL_ERROR**2 * square[..., None]
-        bank, found = learn(
-            state.bank, h[..., None, :], feature_step, frame, model, walk, moved[..., None]
-        )
+        turn = np.sqrt(square) * moved
+        walk = turn[..., None, None] * self._walk
+        drift = REST_DRIFT**2 * duration[..., None]
+        model = drift + MODEL_ERROR**2 * square[..., None]
+        h_each = h[..., None, :]
+        learns = moved[..., None]
+        bank, found = learn(state.bank, h_each, feature_step, frame, model, walk, learns)
 
         evidence = found.square / found.capped + self._m * np.log(found.capped)
-        scores = state.scores + evidence * moved[..., None]
-        scores = np.minimum(scores - np.minimum.reduce(scores, axis=-1)[..., None], LEAD_CAP)
+        scores = state.scores + evidence * learns
+        least = np.minimum.reduce(scores, axis=-1)
+        scores = np.minimum(scores - least[..., None], LEAD_CAP)
         best = scores.argmin(axis=-1)
         last_noise = pick(state.bank[..., : self._m, -1], best)
         streak = self._streak(state, of_filter(found, best), last_noise)
@@ -289,7 +302,8 @@ class Regression:
         columns = state.bank[..., : len(ROTATION_DEVIATIONS), :, self._map]
         rotations, excess = branch(moved | jumped, self._nearest, before, columns)
         state = state._replace(rotations=rotations, excess=excess)
-        noise = 1.0 - (found.variance - frame[..., None]) / found.capped
+        rest = found.variance - frame[..., None]
+        noise = 1.0 - rest / found.capped
         return self._combined(state, best, noise)
 
     def jacobian(
@@ -345,12 +359,15 @@ class Regression:
         alone = found.nu - last
         agrees = np.vecdot(alone, alone) < AGREEMENT * found.square
         goes_on = agrees | (state.streak == 0)
-        return np.asarray(np.where(fits, 0, np.where(goes_on, state.streak + 1, 1)))
+        length = np.where(goes_on, state.streak + 1, 1)
+        return np.asarray(np.where(fits, 0, length))
 
     def _forget(self, state: RegressionState, frame: FloatArray) -> RegressionState:
         """Return the state in which W has its prior variances again."""
-        bank = fresh_bank(state.bank[..., : self._m, :-1], self._P0, frame[..., None])
-        return state._replace(bank=bank, streak=np.zeros_like(state.streak), moves=state.moves + 1)
+        W = state.bank[..., : self._m, :-1]
+        bank = fresh_bank(W, self._P0, frame[..., None])
+        streak = np.zeros_like(state.streak)
+        return state._replace(bank=bank, streak=streak, moves=state.moves + 1)
 
     def _combined(
         self, state: RegressionState, best: IntArray, noise: FloatArray
@@ -371,9 +388,11 @@ class Regression:
         completed = W[..., :near, :, :] - state.excess @ P_M
         W = np.concatenate([completed, W[..., near:, :, :]], axis=-3)
         weights = self.weights(state)
-        mean = np.add.reduce(weights[..., None, None] * W, axis=-3)
+        weighted = weights[..., None, None] * W
+        mean = np.add.reduce(weighted, axis=-3)
         share = np.add.reduce(weights * noise, axis=-1)
-        rotation = pick(state.rotations, np.minimum(best, near - 1))
+        nearest = np.minimum(best, near - 1)
+        rotation = pick(state.rotations, nearest)
         return state._replace(mean=mean, share=share, rotation=rotation)
 
     def _nearest(self, _: Any, columns: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ANN401 - those before
@@ -381,7 +400,8 @@ class Regression:
         m = self._m
         M = columns[..., :m, :]
         P = columns[..., m:, :][..., self._map, :]
-        believed = P + (ROTATION_DEVIATIONS**2)[:, None, None] * np.eye(m)
+        deviations = ROTATION_DEVIATIONS**2
+        believed = P + deviations[:, None, None] * np.eye(m)
         try:
             information = np.linalg.inv(believed)
         except np.linalg.LinAlgError as error:

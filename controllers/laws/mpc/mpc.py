@@ -200,15 +200,15 @@ class MpcLaw(Law[MpcState]):
         m = self._spec.m
         moves = self._shape.moves
         unknown = np.full(lead, np.nan)
-        return MpcState(
-            sent=np.zeros((*lead, len(self._to_come), n)),
-            last=np.zeros((*lead, n)),
-            fallbacks=np.zeros(lead),
-            J=np.full((*lead, m, n), np.nan),
-            targets=np.full((*lead, moves, m), np.nan),
-            final=np.full((*lead, m), np.nan),
-            plan=Plan(np.zeros((*lead, moves, n)), unknown, unknown, unknown),
-        )
+        rest = np.zeros((*lead, moves, n))
+        plan = Plan(rest, unknown, unknown, unknown)
+        sent = np.zeros((*lead, len(self._to_come), n))
+        last = np.zeros((*lead, n))
+        fallbacks = np.zeros(lead)
+        J = np.full((*lead, m, n), np.nan)
+        targets = np.full((*lead, moves, m), np.nan)
+        final = np.full((*lead, m), np.nan)
+        return MpcState(sent, last, fallbacks, J, targets, final, plan)
 
     def command(
         self, state: MpcState, estimate: Estimate, observation: Observation, reference: FloatArray
@@ -224,12 +224,13 @@ class MpcLaw(Law[MpcState]):
         moves, travel = self._unlimited.minimise(J, targets)
         # A ball that is out of view already may not get further out.
         margin = np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0)
-        last = (state.last * self._blocks.periods, self._change * self._spec.period)
+        sent_in_a_block = state.last * self._blocks.periods
+        change_a_period = self._change * self._spec.period
+        last = (sent_in_a_block, change_a_period)
         bounds = joint_bounds(self._shape, self._spec, last, observation.joint_position, margin)
         lead = feature.shape[:-1]
-        plan = Plan(
-            moves, success=np.ones(lead), iterations=np.zeros(lead), active_limits=np.zeros(lead)
-        )
+        none = np.zeros(lead)
+        plan = Plan(moves, success=np.ones(lead), iterations=none, active_limits=none)
         # Only where the optimum without limits exceeds one is the program solved.
         beyond = exceeds(self._shape, bounds, J, moves, travel)
         plan = branch(beyond, self._limited, plan, J, targets, bounds)
@@ -269,7 +270,9 @@ class MpcLaw(Law[MpcState]):
             error = reference[..., 0, :] - feature
             return feature, error, np.zeros((self._blocks.count, self._spec.m))
         rows = sampled(reference, self._places)
-        return feature, rows[..., 0, :] - feature, rows[..., 1:, :] - rows[..., :1, :]
+        error = rows[..., 0, :] - feature
+        ahead = rows[..., 1:, :] - rows[..., :1, :]
+        return feature, error, ahead
 
     def diagnostics(self, state: MpcState) -> Diagnostics:
         """Return success and iterations of the solver, objective, fallbacks so far, active limits, predicted error.
@@ -277,8 +280,10 @@ class MpcLaw(Law[MpcState]):
         Without an active limit the plan is that of the closed form, after no iteration.
         """
         plan = state.plan
-        travel = plan.moves.sum(axis=-2) * (self._blocks.count / self._shape.moves)
-        objective = where(plan.success > 0.0, self._objective(state), np.asarray(math.nan))
+        blocks_a_move = self._blocks.count / self._shape.moves
+        travel = plan.moves.sum(axis=-2) * blocks_a_move
+        solved = plan.success > 0.0
+        objective = where(solved, self._objective(state), np.asarray(math.nan))
         predicted = np.matvec(state.J, travel)
         return {
             "solver_success": plan.success,
