@@ -29,7 +29,7 @@ import stored_tables
 from page_studies import STUDIES
 from page_studies.study import Study
 from servobench.harness.batch import results
-from servobench.harness.batch.results import read_manifest
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.installation import CODE_FOLDERS
 from servobench.harness.run.result import CRASHED
 
@@ -192,7 +192,7 @@ def stamp(study: Study, folder: Path) -> dict[str, str]:
     first = folder / carried_out[0]
     # A suite's, one for each challenge
     parts = sorted(path.parent for path in first.glob(f"*/{results.MANIFEST}"))
-    manifest = read_manifest(parts[0] if parts else first)
+    manifest = ResultsFolder(parts[0] if parts else first).manifest
     return {
         "study": study.name,
         "commit": str(manifest["git_commit"]),

@@ -38,6 +38,7 @@ from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import is_unused
 from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.batch.tables import UnwritableFolder
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import knowledge as network_cache
@@ -124,7 +125,7 @@ class Batches:
 
     def outcome(self, point: Path) -> list[object]:
         """Return the tables; raise AssertionError where the folder is not as it should be."""
-        found = examine(point)
+        found = examine(ResultsFolder(point))
         assert not found.findings, found.findings
         left = {path.name for path in point.iterdir()} - {
             results.STEPS,
@@ -144,7 +145,7 @@ class Batches:
 
     def look(self, point: Path) -> None:
         """Read what an interrupted attempt has left."""
-        if not is_unused(point) and results.part_indices(point):
+        if not is_unused(point) and ResultsFolder(point).part_indices():
             results.load_runs(point)
 
     def refusal(self, error: Exception) -> str:

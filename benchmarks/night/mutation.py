@@ -62,13 +62,13 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
          "harness/test_page_tables.py"),
     ),
     "results": (
-        ("harness/batch/results.py", "harness/batch/tables.py"),
+        ("harness/batch/results.py", "harness/batch/store.py", "harness/batch/tables.py"),
         ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py",
          "harness/test_foreign_folders.py"),
     ),
     "folders": (
         ("harness/batch/tables.py", "plant/contract/checksums.py", "harness/batch/integrity.py",
-         "harness/batch/results.py"),
+         "harness/batch/results.py", "harness/batch/store.py"),
         ("plant/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py",
          "harness/test_foreign_folders.py"),
     ),

@@ -15,6 +15,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,11 @@ from servobench.fmus.reference import read_table
 from servobench.harness.analysis.folder import describe_folder, describe_settings
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.apps.tuning.objective import Ledger
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, current_holder, locked
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.cli.selection import split
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
@@ -198,7 +200,7 @@ def part_name(name: str, folder: Path) -> None:
 
 def other_table(text: str, folder: Path) -> None:
     """Read a folder with a table of somebody beside those of the batch."""
-    list(results.other_tables(_folder(folder / "out", {**files(), "mine.csv": text})))
+    list(ResultsFolder(_folder(folder / "out", {**files(), "mine.csv": text})).other_tables())
 
 
 def lock(text: str, folder: Path) -> None:
@@ -251,11 +253,11 @@ def files(*, parts: bool = False) -> dict[str, bytes]:
     }
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "out"
-        results.create_folder(folder, MANIFEST)
-        results.write_part(folder, 0, [RunResult(row, steps)], "c")
-        results.write_part(folder, 1, [RunResult(row | lost, None, trace="here")], "c")
+        store.create_folder(folder, MANIFEST)
+        store.write_part(folder, 0, [RunResult(row, steps)], "c")
+        store.write_part(folder, 1, [RunResult(row | lost, None, trace="here")], "c")
         if not parts:
-            results.collect(folder)
+            store.collect(ResultsFolder(folder))
         return {
             str(path.relative_to(folder)): path.read_bytes()
             for path in folder.rglob("*")
@@ -267,21 +269,25 @@ def _read_folder(folder: Path) -> None:
     """Read a folder by everything that reads one, and raise the first refusal at the end."""
     refusals = []
     readers = (
-        results.read_manifest, results.load_runs, results.load_steps, results.finished_runs, examine,
-        describe_settings, _judged, results.collect,
+        attrgetter("manifest"), ResultsFolder.runs, ResultsFolder.steps, ResultsFolder.finished_runs, examine,
+        _settings, _judged, store.collect,
     )  # fmt: skip
     for read in readers:
         try:
-            read(folder)
+            read(ResultsFolder(folder))
         except ConfigurationError as error:
             refusals.append(error)
     if refusals:
         raise ConfigurationError(str(refusals[0]))
 
 
-def _judged(folder: Path) -> None:
-    runs = results.load_runs(folder)
-    describe_folder(folder, runs)
+def _settings(folder: ResultsFolder) -> None:
+    describe_settings(folder.configuration)
+
+
+def _judged(folder: ResultsFolder) -> None:
+    runs = folder.runs()
+    describe_folder(folder.manifest, runs)
     list(statistics_tables(runs))
 
 

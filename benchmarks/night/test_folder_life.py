@@ -26,12 +26,13 @@ from hypothesis.stateful import (
 )
 
 from kit.command import judged
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import locked
 from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
@@ -194,7 +195,7 @@ class FolderLife(RuleBasedStateMachine):
     def collect(self) -> None:
         """A user puts together what there is."""
         with locked(self.folder):
-            assert 0 < results.collect(self.folder) <= RUNS
+            assert 0 < store.collect(ResultsFolder(self.folder)) <= RUNS
 
     @rule()
     def read(self) -> None:
@@ -241,7 +242,7 @@ class FolderLife(RuleBasedStateMachine):
 
 def results_there(folder: Path) -> bool:
     return (folder / results.RUNS).exists() or (
-        folder.is_dir() and bool(results.part_indices(folder))
+        folder.is_dir() and bool(ResultsFolder(folder).part_indices())
     )
 
 

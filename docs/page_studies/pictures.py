@@ -12,6 +12,7 @@ from page_studies.study import FIVE, Study
 from servobench.harness.apps.films.film import draw_frame
 from servobench.harness.apps.films.replay import logged_run
 from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.pictures.figures import Choice, folder_figures
 from servobench.harness.pictures.style import drawing_of
 
@@ -39,7 +40,7 @@ def readme_pictures(folder: Path) -> dict[str, bytes]:
     frame = draw_frame(logged_run(row, results.load_steps(batch, [row["run_id"]])), PERIOD)
     figures = {
         f"pictures/{FILES[named.kind]}.png": b64decode(drawing_of(named.figure).data)
-        for named in folder_figures(batch, Choice(tuple(FILES)))
+        for named in folder_figures(ResultsFolder(batch), Choice(tuple(FILES)))
     }
     return {"pictures/bench.png": small(Image.fromarray(frame))} | figures
 

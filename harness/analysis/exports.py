@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, write_atomically, write_csv, writing_together
@@ -30,7 +30,7 @@ TOPICS: Final = (
 KEYS: Final = ("run_id", "step", "time_s")  # columns that say where a row belongs
 
 
-def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
+def export_folder(folder: ResultsFolder, out: Path, kind: str) -> list[Path]:
     """Write the steps of every run of a results folder into a file of its own.
 
     Args:
@@ -48,8 +48,8 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
         raise ConfigurationError(f"format must be one of {', '.join(FORMATS)}, got {kind!r}")
     if kind == MCAP:
         check_installed((MCAP,), "the format mcap")
-    runs = results.load_runs(folder)
-    results.check_steps(folder)
+    runs = folder.runs()
+    folder.check_steps()
     with accessing(out):
         if out.exists():
             raise ConfigurationError(f"{out} exists already; name a new folder")
@@ -58,14 +58,14 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
     return [out / path.name for path in files]
 
 
-def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[Path]:
+def _write_runs(folder: ResultsFolder, runs: pd.DataFrame, out: Path, kind: str) -> list[Path]:
     """Write the steps of `runs`, and for CSV their table, into a new folder and return the files."""
     files = [out / "runs.csv"] if kind == CSV else []
     if kind == CSV:
         write_csv(runs, files[0])
     for row in runs.to_dict("records"):
         if row.get("periods", 1) > 0:
-            steps = results.load_steps(folder, [row["run_id"]])
+            steps = folder.steps([row["run_id"]])
             files.append(out / f"{row['run_id']}.{kind}")
             if kind == CSV:
                 write_csv(steps, files[-1])

@@ -3,7 +3,6 @@
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
@@ -11,7 +10,7 @@ import pandas as pd
 from servobench.controllers.aids import describe_aids
 from servobench.harness.analysis.comparison import FROM_TWIN, shown_value
 from servobench.harness.analysis.tables import PAIR, Tables
-from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
@@ -21,12 +20,8 @@ from servobench.plant.contract.settings import listed
 DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")
 
 
-def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
-    """Return the facts of a folder: runs, controllers, plants, tasks, seeds and versions, as names and texts.
-
-    Raises:
-        ConfigurationError: not a results folder.
-    """
+def describe_folder(manifest: Mapping[str, Any], runs: pd.DataFrame) -> dict[str, str]:
+    """Return the facts of a folder: runs, controllers, plants, tasks, seeds and versions, as names and texts."""
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
     described = {name: (name, 1.0) for name in DESCRIBED if name in runs}
@@ -34,7 +29,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     for name, (heading, factor) in described.items():
         facts[heading] = listed([shown_value(value, factor) for value in runs[name].unique()])
     facts["seeds"] = _seeds(runs["seed"].tolist())
-    facts["made"] = _made(results.read_manifest(folder))
+    facts["made"] = _made(manifest)
     return facts
 
 
@@ -48,23 +43,18 @@ def _made(manifest: Mapping[str, Any]) -> str:
     return f"{made}, Python {manifest.get('python', 'unknown')}"
 
 
-def titled_runs(folder: Path) -> pd.DataFrame:
-    """Return a folder's runs as `load_runs`, for titles: the mismatch none of robots drawn from a twin says so."""
-    runs = results.load_runs(folder)
-    robots = results.read_manifest(folder).get("robots") or ()
+def titled_runs(folder: ResultsFolder) -> pd.DataFrame:
+    """Return a folder's runs for titles: the mismatch none of robots drawn from a twin says so."""
+    runs = folder.runs()
+    robots = folder.manifest.get("robots") or ()
     twins = [each.get("name") for each in robots if str(each.get("title")).endswith(" twin")]
     names = runs.get("robot", runs["mismatch"])  # an old table has no column of robots
     drawn = (runs["mismatch"] == "none") & names.isin(twins)
     return runs.assign(mismatch=runs["mismatch"].mask(drawn, FROM_TWIN))
 
 
-def describe_controllers(folder: Path) -> str:
-    """Return one line that says which of several controllers have the aids, by their settings; empty for a single one.
-
-    Raises:
-        ConfigurationError: not a results folder.
-    """
-    manifest = results.read_manifest(folder)
+def describe_controllers(manifest: Mapping[str, Any]) -> str:
+    """Return one line that says which of several controllers have the aids; empty for a single one."""
     names = manifest.get("controllers", ())
     if len(names) < 2:
         return ""
@@ -80,14 +70,9 @@ def describe_controllers(folder: Path) -> str:
     return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
 
 
-def describe_settings(folder: Path) -> dict[str, str]:
-    """Return every setting of the runs by section and name; empty where the folder has none.
-
-    Raises:
-        ConfigurationError: not a results folder.
-    """
+def describe_settings(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Return every setting of the runs, given by section and name, as `section.name` and its text."""
     settings = {}
-    configuration = results.read_manifest(folder).get("configuration", {})
     for section, values in configuration.items():
         for name, value in values.items():
             settings[f"{section}.{name}"] = _setting(value)
@@ -186,14 +171,9 @@ def _heading(name: str, side: str) -> str:
     return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}"
 
 
-def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
-    """Return a paragraph that says how the runs of a folder were made, from its manifest, and its BibTeX entry.
-
-    Raises:
-        ConfigurationError: not a results folder.
-    """
-    manifest = results.read_manifest(folder)
-    facts = describe_folder(folder, runs)
+def methods_paragraph(manifest: Mapping[str, Any], runs: pd.DataFrame) -> str:
+    """Return a paragraph that says how the runs of a folder were made, from its manifest, and its BibTeX entry."""
+    facts = describe_folder(manifest, runs)
     packages = manifest.get("packages") or {}
     version = str(packages.get("servobench") or "unknown").translate(SIGNS)
     commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
@@ -203,7 +183,7 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     first = f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, {tools})"
     sentences = [
         _combinations(manifest, facts),
-        *_aids(folder),
+        *_aids(manifest),
         *_varied(facts, runs),
         _robots(facts, runs),
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
@@ -235,9 +215,9 @@ def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
     )
 
 
-def _aids(folder: Path) -> list[str]:
+def _aids(manifest: Mapping[str, Any]) -> list[str]:
     """Return a sentence on the aids of several controllers; none for a single one."""
-    aids = describe_controllers(folder)
+    aids = describe_controllers(manifest)
     if not aids:
         return []
     return [f"Aids (stages around the law, which any controller can have): {aids}"]

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.isolation import GUARD, START_ERROR
 from servobench.harness.batch.plan import (
@@ -26,6 +25,7 @@ from servobench.harness.batch.plan import (
     refuse_tuning_seeds,
 )
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder, load_runs
 from servobench.harness.config.registry import (
     can_travel,
     choose_controller,
@@ -221,10 +221,10 @@ def compare(
         given = Settings(settings or {})
         if out is not None:
             carry_out(comparison(batch, given), Path(out), how)
-            return results.load_runs(Path(out))
+            return load_runs(Path(out))
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
             carry_out(Campaign(Grid(Cell, batch.requests()), given), Path(folder), how)
-            return results.load_runs(Path(folder))
+            return load_runs(Path(folder))
 
 
 def _seeds(given: object) -> Sequence[int]:
@@ -264,10 +264,10 @@ def load(folder: Path | str) -> Results:
         ConfigurationError: not a results folder, or one of another schema.
     """
     _require(isinstance(folder, str | os.PathLike), "folder", "the path of a folder", folder)
-    path = Path(folder)
-    runs = results.load_runs(path)
-    steps = results.load_steps(path) if results.has_steps(path) else None
-    return Results(runs, steps, results.read_manifest(path))
+    opened = ResultsFolder(Path(folder))
+    runs = opened.runs()
+    steps = opened.steps() if opened.has_steps() else None
+    return Results(runs, steps, opened.manifest)
 
 
 def _task_name(given: str) -> str:

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import pandas as pd
 
-from servobench.harness.batch import results
+from servobench.harness.batch import store
 from servobench.harness.batch.blocks import (
     BLOCK,
     CHUNK,
@@ -37,6 +37,8 @@ from servobench.harness.batch.lock import check_empty, is_unused, locked
 from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder, load_runs
+from servobench.harness.batch.schema import encode
 from servobench.harness.batch.tables import refuse_nameless, writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings, flatten
@@ -134,7 +136,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     if not how.resume:
         check_empty(folder, can_resume=len(campaign.cells) > 1)
     elif not is_unused(folder):
-        check_resumable(folder)
+        check_resumable(ResultsFolder(folder))
     runs = survey(Grid(attrgetter("request"), campaign.cells))
     if how.part[1] > runs.count:
         raise ConfigurationError(
@@ -165,7 +167,7 @@ def carry_out_parts(
     """
     for name, campaign in parts.items():
         carry_out(campaign, folder / name, how)
-    return {name: results.load_runs(folder / name) for name in parts}
+    return {name: load_runs(folder / name) for name in parts}
 
 
 def _carry_out_at(
@@ -188,6 +190,7 @@ def _carry_out_at(
     )
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
+    opened = ResultsFolder(folder)
     with locked(folder) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
@@ -196,25 +199,25 @@ def _carry_out_at(
         if how.resume and not resumed:
             how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
         if resumed:
-            restored = restore_manifest(folder, manifest)
+            restored = restore_manifest(opened, manifest)
             check_same_batch(
-                folder, manifest, how.observer.note, remedy="give another folder as `out`"
+                opened, manifest, how.observer.note, remedy="give another folder as `out`"
             )
             # Before anything is computed
-            mended = list(mend(folder, manifest))
+            mended = list(mend(opened, manifest))
             if restored:
                 mended.insert(0, restored)
             for line in mended:
                 how.observer.note(f"note: {line}")
         else:
-            results.create_folder(folder, manifest)
-        if not resumed or not results.is_whole(folder, runs.count):
-            for block, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
+            store.create_folder(folder, manifest)
+        if not resumed or not opened.is_whole(runs.count):
+            for block, outcome in _carry_out_missing(campaign, jobs, own, opened, place, how):
                 with writing(folder):
                     lock.check()  # the folder may have been removed
-                results.write_part(folder, block.jobs[0].index, outcome, manifest["campaign"])
+                store.write_part(folder, block.jobs[0].index, outcome, manifest["campaign"])
                 how.observer.finished([result.row for result in outcome])
-        results.put_together(folder, manifest)
+        store.put_together(opened, manifest)
 
 
 def check_campaign(
@@ -247,22 +250,22 @@ def check_campaign(
 
 
 def check_same_batch(
-    folder: Path, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str
+    folder: ResultsFolder, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str
 ) -> None:
     """Refuse a folder of another batch than that of a manifest; `note` gets a line for each difference that may matter.
 
     Raises:
         ConfigurationError: other runs or settings, or another version of a file of the user's.
     """
-    there = results.read_manifest(folder)
+    there = folder.manifest
     if there.get("campaign") != manifest.get("campaign"):
         other = difference(there, manifest)
         raise ConfigurationError(
-            f"{folder} holds results of other runs or settings: {other}; {remedy}"
+            f"{folder.path} holds results of other runs or settings: {other}; {remedy}"
         )
     if changed := changed_source(there, manifest):
         raise ConfigurationError(
-            f"{folder} was begun with another version of {changed}; {remedy}, or bring the former one back"
+            f"{folder.path} was begun with another version of {changed}; {remedy}, or bring the former one back"
         )
     for key, things in (
         ("git_commit", "commit"),
@@ -271,7 +274,7 @@ def check_same_batch(
         ("blas", "BLAS"),
     ):
         if there.get(key) != manifest.get(key):
-            note(f"note: {folder} was begun with other {things}; later runs may differ")
+            note(f"note: {folder.path} was begun with other {things}; later runs may differ")
 
 
 def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> int:
@@ -290,27 +293,31 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
     Raises:
         ConfigurationError: a folder without parts, of another batch or with a damaged file, or a run that two have.
     """
-    manifest, found = results.read_manifest(folders[0]), list[tuple[range, Path]]()
+    opened = [ResultsFolder(folder) for folder in folders]
+    manifest = opened[0].manifest
+    found: list[tuple[range, ResultsFolder]] = []
     tables = []
-    for folder in folders:
+    for folder in opened:
         # Refuses a table of anything else, whose names are of files
-        tables.append(results.load_runs(folder))
+        tables.append(folder.runs())
         check_same_batch(folder, manifest, note, remedy="leave it away")
-        if not (parts := results.finished_runs(folder)):
+        if not (parts := folder.finished_runs()):
             raise ConfigurationError(
-                f"{folder} holds a whole batch, no part; join tables of several with pandas"
+                f"{folder.path} holds a whole batch, no part; join tables of several with pandas"
             )
         found += [(each, folder) for each in parts]
     found.sort(key=lambda pair: pair[0].start)
     for (runs, folder), (others, other) in pairwise(found):
         if others.start < runs.stop:
-            raise ConfigurationError(f"{folder} and {other} have the same runs: leave one away")
+            raise ConfigurationError(
+                f"{folder.path} and {other.path} have the same runs: leave one away"
+            )
     refuse_nameless(out, pd.concat(tables, ignore_index=True))
     check_empty(out)
     with writing(out), writing_together(out) as partial:
-        results.create_folder(partial, manifest)
-        results.copy_parts(((folder, runs.start) for runs, folder in found), partial)
-        return results.put_together(partial, manifest)
+        store.create_folder(partial, manifest)
+        store.copy_parts(((folder, runs.start) for runs, folder in found), partial)
+        return store.put_together(ResultsFolder(partial), manifest)
 
 
 def _jobs(
@@ -338,7 +345,7 @@ def _carry_out_missing(
     campaign: Campaign,
     jobs: _MakeJobs,
     own: tuple[Offer, ...],
-    folder: Path,
+    folder: ResultsFolder,
     place: Workers,
     how: Execution,
 ) -> Iterator[tuple[Block, list[RunResult]]]:
@@ -346,9 +353,7 @@ def _carry_out_missing(
     begin, end = (
         len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0])
     )
-    there = (
-        range(max(each.start, begin), min(each.stop, end)) for each in results.finished_runs(folder)
-    )
+    there = (range(max(each.start, begin), min(each.stop, end)) for each in folder.finished_runs())
     done = list(filter(None, there))  # a block of another part may reach over the borders
     missing = end - begin - sum(map(len, done))
     how.observer.begin(end - begin, end - begin - missing)
@@ -356,7 +361,7 @@ def _carry_out_missing(
     gaps = (range(one.stop, next_one.start) for one, next_one in pairwise(ends))
     size = even_size(missing, place.count, how.block)
     blocks = cut(jobs(chain.from_iterable(gaps)), size, 1 if campaign.steps else CHUNK, own)
-    keep = folder if campaign.steps and not place.cluster else None
+    keep = folder.path if campaign.steps and not place.cluster else None
     return carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
 
 
@@ -416,7 +421,7 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
         there: manifest of the folder.
         here: manifest of the new batch.
     """
-    here = json.loads(results.encode(here))
+    here = json.loads(encode(here))
     old = {key: there.get(key) for key in NAMES} | flatten(there.get("configuration", {}))
     new = {key: here[key] for key in NAMES} | flatten(here["configuration"])
     for key in dict.fromkeys([*old, *new]):

@@ -4,13 +4,21 @@ import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
-from servobench.harness.batch import results, tables
+from servobench.harness.batch import tables
 from servobench.harness.batch.lock import PARTS, refuse_links
-from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
-from servobench.harness.batch.tables import DamagedFile, lacking, sums_of, writing
+from servobench.harness.batch.results import (
+    FAILURES,
+    PART,
+    RUNS,
+    STEPS,
+    ResultsFolder,
+    part_name,
+)
+from servobench.harness.batch.schema import MANIFEST, OtherSchema
+from servobench.harness.batch.store import write_manifest
+from servobench.harness.batch.tables import DamagedFile, lacking, writing
 from servobench.harness.run.result import log_entry
 from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
@@ -44,7 +52,7 @@ class Examination:
     left_out: list[str]
 
 
-def examine(folder: Path) -> Examination:
+def examine(folder: ResultsFolder) -> Examination:
     """Read all files of a results folder and list the damaged ones.
 
     Raises:
@@ -52,11 +60,12 @@ def examine(folder: Path) -> Examination:
             columns or identifiers.
     """
     check_resumable(folder)
-    refuse_links(folder)
-    findings, manifest = [], dict[str, Any]()
+    refuse_links(folder.path)
+    findings: list[Finding] = []
+    manifest: dict[str, Any] = {}
     try:
-        manifest = results.read_manifest(folder)
-    except results.OtherSchema:
+        manifest = folder.manifest
+    except OtherSchema:
         raise
     except ConfigurationError as error:
         unread = error.fault if isinstance(error, DamagedFile) else "cannot be read"
@@ -65,12 +74,12 @@ def examine(folder: Path) -> Examination:
                 MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"
             )
         )
-    if sums_of(folder) is None:
-        remedy = f"if you trust the files as they are: cd {folder} && sha256sum {MANIFEST} *.parquet > {SUMS}"
+    if folder.sums is None:
+        remedy = f"if you trust the files as they are: cd {folder.path} && sha256sum {MANIFEST} *.parquet > {SUMS}"
         findings.append(
             Finding(SUMS, "is missing, so that nothing vouches for the other files", remedy)
         )
-    names = [name for name in (RUNS, STEPS, FAILURES) if results.is_expected(folder, name)]
+    names = [name for name in (RUNS, STEPS, FAILURES) if folder.expects(name)]
     faults = {name: wrong for name in names if (wrong := _fault(folder, name))}
     for name, wrong in faults.items():
         remedy = (
@@ -89,37 +98,37 @@ def examine(folder: Path) -> Examination:
             )
     strays = [
         path.name
-        for path in sorted((folder / PARTS).glob("[!.]*"))
+        for path in sorted((folder.path / PARTS).glob("[!.]*"))
         if not PART.fullmatch(path.name)
     ]
     findings += [
         Finding(f"{PARTS}/{name}", "is no file of a batch", "move it elsewhere") for name in strays
     ]
     if RUNS in names and not faults.keys() & {RUNS, STEPS}:
-        count = max(count, tables.row_count(folder, RUNS))
+        count = max(count, tables.row_count(folder.path, RUNS))
     if count and not findings:
-        results.load_runs(folder)
-    beside = results.accompanying(folder)
+        folder.runs()  # refuses wrong columns and identifiers
+    beside = folder.accompanying()
     for name in beside:
-        if wrong := results.file_fault(folder, name):
+        if wrong := folder.fault_of(name):
             findings.append(Finding(name, wrong, REMADE))
-    left_out = [name for name in results.unlisted(folder) if name not in names and name != MANIFEST]
+    left_out = [name for name in folder.unlisted() if name not in names and name != MANIFEST]
     return Examination(
         findings, len(names) + 1 + len(beside), count, manifest.get("run_count", 0), left_out
     )
 
 
-def check_resumable(folder: Path) -> None:
+def check_resumable(folder: ResultsFolder) -> None:
     """Refuse a folder in which nothing of a batch is left.
 
     Raises:
         ConfigurationError: names it.
     """
-    if not any((folder / name).exists() for name in (MANIFEST, RUNS, SUMS, PARTS)):
-        results.read_manifest(folder)  # says why it cannot
+    if not any((folder.path / name).exists() for name in (MANIFEST, RUNS, SUMS, PARTS)):
+        _ = folder.manifest  # The error says why there is none.
 
 
-def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+def mend(folder: ResultsFolder, manifest: Mapping[str, Any]) -> Iterator[str]:
     """Remove the damaged files of a folder whose batch is to go on, so that their runs count as missing.
 
     Args:
@@ -129,43 +138,42 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
     Yields:
         A line for each damaged file.
     """
-    sums, kept = sums_of(folder) or {}, dict[str, frozenset[str]]()
-    with writing(folder):
+    path = folder.path
+    sums = folder.sums or {}
+    kept: dict[str, frozenset[str]] = {}
+    with writing(path):
         for part in _parts(folder, manifest):
             if part.fault:
-                yield f"{folder / part.wrong} {part.fault}: its runs are carried out again"
+                yield f"{path / part.wrong} {part.fault}: its runs are carried out again"
                 for name in reversed(
                     part.names
                 ):  # the rows first: without them the part does not count
-                    (folder / name).unlink(missing_ok=True)
+                    (path / name).unlink(missing_ok=True)
             else:
-                kept |= {name: frozenset([digest(folder / name)]) for name in part.names}
+                kept |= {name: frozenset([digest(path / name)]) for name in part.names}
         for name in (MANIFEST, RUNS, STEPS, FAILURES):
-            wrong = _fault(folder, name) if results.is_expected(folder, name) else None
+            wrong = _fault(folder, name) if folder.expects(name) else None
             if name in sums:
                 kept[name] = sums[name]
-            elif (wrong is None or name == MANIFEST) and (folder / name).exists():
-                kept[name] = frozenset([digest(folder / name)])
+            elif (wrong is None or name == MANIFEST) and (path / name).exists():
+                kept[name] = frozenset([digest(path / name)])
             if wrong and name in (RUNS, STEPS):
-                yield f"{folder / name} {wrong}: runs that are in no part are carried out again"
-        keep_sums(folder, kept | results.accompanying(folder))
-        for path in (
-            *folder.glob(".*"),
-            *(folder / PARTS).glob(".*"),
-        ):  # remains of a process that was killed
-            if PARTIAL.fullmatch(path.name):
-                path.unlink()
-        if not results.is_whole(folder, manifest["run_count"]):
-            (folder / PARTS).mkdir(exist_ok=True)
+                yield f"{path / name} {wrong}: runs that are in no part are carried out again"
+        keep_sums(path, kept | folder.accompanying())
+        for left in (*path.glob(".*"), *(path / PARTS).glob(".*")):
+            if PARTIAL.fullmatch(left.name):  # by a process that was killed
+                left.unlink()
+        if not folder.is_whole(manifest["run_count"]):
+            (path / PARTS).mkdir(exist_ok=True)
             return
-        if FAILURES in kept and (wrong := results.file_fault(folder, FAILURES)):
-            yield f"{folder / FAILURES} {wrong}: it is written anew, without traces"
+        if FAILURES in kept and (wrong := folder.fault_of(FAILURES)):
+            yield f"{path / FAILURES} {wrong}: it is written anew, without traces"
             write_vouched(
-                folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")}
+                path, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")}
             )
 
 
-def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
+def restore_manifest(folder: ResultsFolder, manifest: dict[str, Any]) -> str:
     """Write a manifest anew that is damaged or missing, if all intact tables say that they are of that batch.
 
     Args:
@@ -178,30 +186,32 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
     Raises:
         ConfigurationError: tables are of another batch or do not say of which, or the folder is of another schema.
     """
+    path = folder.path
     try:
-        results.read_manifest(folder)
+        _ = folder.manifest
     except DamagedFile as error:
         damage = error
     except ConfigurationError:
-        if (folder / MANIFEST).exists():
+        if (path / MANIFEST).exists():
             raise
-        damage = DamagedFile(folder, MANIFEST, "is missing")
+        damage = DamagedFile(path, MANIFEST, "is missing")
     else:
         return ""
-    names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
-    names += [RUNS] if (folder / RUNS).exists() else []
-    owners = set[str]()
+    names = [part_name(index, RUNS) for index in folder.part_indices()]
+    if (path / RUNS).exists():
+        names.append(RUNS)
+    owners: set[str] = set()
     for name in names:
         with contextlib.suppress(DamagedFile):  # which is made again in any case
-            owners.add(tables.owner(folder, name).partition("@")[0])
+            owners.add(tables.owner(path, name).partition("@")[0])
     if owners != {manifest["campaign"]}:
         raise ConfigurationError(
-            f"{folder / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "
+            f"{path / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "
             "restore the file from a copy, or give another folder as `out`"
         ) from damage
-    with writing(folder):
-        results.write_manifest(folder, manifest)
-    return f"{folder / MANIFEST} {damage.fault}: it is written anew"
+    with writing(path):
+        write_manifest(path, manifest)
+    return f"{path / MANIFEST} {damage.fault}: it is written anew"
 
 
 @dataclass(frozen=True)
@@ -212,18 +222,20 @@ class _Part:
     fault: str  # fault of that file; empty if there is none
 
 
-def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:
+def _parts(folder: ResultsFolder, manifest: Mapping[str, Any]) -> Iterator[_Part]:
     """Yield the parts of a folder, in order; where the manifest does not tell the batch, parts may be of any."""
-    campaign, end = manifest.get("campaign"), 0
-    for index in results.part_indices(folder):
-        names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
-        names = [name for name in names if results.is_expected(folder, name)]
-        rows, count = results.part_name(index, RUNS), 0
+    campaign = manifest.get("campaign")
+    end = 0
+    for index in folder.part_indices():
+        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
+        names = [name for name in names if folder.expects(name)]
+        rows = part_name(index, RUNS)
+        count = 0
         faults = {name: wrong for name in names if (wrong := _fault(folder, name))}
         name, wrong = next(iter(faults.items()), (rows, ""))
         if not wrong:
-            count = tables.row_count(folder, rows)
-            batch, _, first = tables.owner(folder, rows).rpartition("@")
+            count = tables.row_count(folder.path, rows)
+            batch, _, first = tables.owner(folder.path, rows).rpartition("@")
             if batch not in ("", campaign or batch):
                 wrong = "holds the rows of another batch"
             elif first not in ("", f"{index}"):
@@ -237,13 +249,13 @@ def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:
         yield _Part(names, 0 if wrong else count, name, wrong)
 
 
-def _fault(folder: Path, name: str) -> str | None:
+def _fault(folder: ResultsFolder, name: str) -> str | None:
     """Return the fault of a file; a table without a checksum is read as a whole."""
-    wrong = results.file_fault(folder, name)
-    if wrong is None and sums_of(folder) is None and name.endswith(".parquet"):
+    wrong = folder.fault_of(name)
+    if wrong is None and folder.sums is None and name.endswith(".parquet"):
         try:
-            schema = tables.common_schema(folder, [name])
-            for _ in tables.row_groups(folder, name, schema.names):
+            schema = tables.common_schema(folder.path, [name])
+            for _ in tables.row_groups(folder.path, name, schema.names):
                 pass
             wrong = lacking("runs" if name.endswith(RUNS) else "steps", schema) or None
         except DamagedFile as error:
@@ -251,9 +263,9 @@ def _fault(folder: Path, name: str) -> str | None:
     return wrong
 
 
-def _log(folder: Path) -> str:
+def _log(folder: ResultsFolder) -> str:
     """Return the log of failures as far as it can be made from the table of runs."""
-    groups = tables.row_groups(folder, RUNS, ("run_id", "status", "reason"))
+    groups = tables.row_groups(folder.path, RUNS, ("run_id", "status", "reason"))
     rows = (
         dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy()
     )

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.description import plain, restored
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.config.settings import Settings, flatten, nest
@@ -42,27 +42,29 @@ class UnevenRows(ConfigurationError):
     """Rows of a log that are missing, doubled or out of order."""
 
 
-def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
+def find_run(folder: ResultsFolder, run_id: str | None) -> dict[str, Any]:
     """Return the row of a run of a results folder; without a name the only one.
 
     Raises:
         ConfigurationError: not a results folder with steps, no such run, or several without a name.
     """
-    runs = results.load_runs(folder)
-    results.check_steps(folder)
+    runs = folder.runs()
+    folder.check_steps()
     names = runs["run_id"].tolist()
     if run_id is None and len(names) > 1:
         raise ConfigurationError(
-            f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}"
+            f"{folder.path} holds {len(names)} runs; name one with --run, such as {names[0]}"
         )
     chosen = run_id or names[0]
     if chosen not in names:
-        raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
+        raise ConfigurationError(
+            f"{folder.path} has no run {chosen!r}: {suggest(chosen, names[:20])}"
+        )
     return {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
 
 
 def logged_in_folder(
-    folder: Path, run_id: str | None, controller: str | None, sensing: str = ""
+    folder: ResultsFolder, run_id: str | None, controller: str | None, sensing: str = ""
 ) -> tuple[ResolvedRun, pd.DataFrame]:
     """Return a run of a results folder and its steps.
 
@@ -76,7 +78,8 @@ def logged_in_folder(
         ConfigurationError: no such run, one without steps, one whose row names code that the user did not name, or one
             that cannot be made ready here.
     """
-    row, manifest = find_run(folder, run_id), results.read_manifest(folder)
+    row = find_run(folder, run_id)
+    manifest = folder.manifest
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
         name = str(row.get(word, ""))
         # Code of users may have any name.
@@ -88,9 +91,9 @@ def logged_in_folder(
                 else f"name it by --{word} if you trust it"
             )
             raise ConfigurationError(
-                f"{folder} names code that would be run, {word} {place or name}; {remedy}"
+                f"{folder.path} names code that would be run, {word} {place or name}; {remedy}"
             )
-    steps = results.load_steps(folder, [row["run_id"]])
+    steps = folder.steps([row["run_id"]])
     if steps.empty:
         raise ConfigurationError(
             f"run {row['run_id']} has no steps: it ended before its first period"
@@ -98,7 +101,7 @@ def logged_in_folder(
     names = ("plant", "task", "mismatch", "robot", "sensing")
     own = row.get("robot") == OWN_ROBOT  # which comes with the plant
     asked = {name: row[name] for name in names if name in row and not (own and name == "robot")}
-    with configuration_errors(f"{folder} has a varied setting that is no value: "):
+    with configuration_errors(f"{folder.path} has a varied setting that is no value: "):
         varied = varied_in_row(row)
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))

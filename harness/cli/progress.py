@@ -12,8 +12,8 @@ from rich import progress
 from rich.console import Console
 from rich.text import Text
 
-from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, Observer, Row
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.cli.terminal import end_interrupted
 from servobench.plant.contract.files import harmless
 
@@ -212,7 +212,8 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
         if not any(folder.rglob("*.parquet")):
             raise
         # A last one may be untold
-        done = max(observer.done, sum(map(len, results.finished_runs(folder))))
+        there = sum(map(len, ResultsFolder(folder).finished_runs()))
+        done = max(observer.done, there)
         kept = f"{done} of {observer.total} runs are finished and kept in {folder}"
         end_interrupted(kept, "the same call with --resume and this --out continues")
     finally:

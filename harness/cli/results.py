@@ -24,6 +24,8 @@ from servobench.plant.contract.files import accessing, writing_together
 if TYPE_CHECKING:
     import pandas as pd
 
+    from servobench.harness.batch.results import ResultsFolder
+
 MAX_SATURATED: Final = 0.8  # share of the periods
 MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
 
@@ -57,14 +59,15 @@ def statistics(
         titled_runs,
     )
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
-    from servobench.harness.batch import results
+    from servobench.harness.batch.results import ResultsFolder
 
     if markdown + latex + as_json > 1:
         raise ConfigurationError(
             "--markdown, --latex and --json are ways to print the same; give one of them"
         )
-    runs = titled_runs(folder)
-    missing = results.describe_missing(folder)
+    opened = ResultsFolder(folder)
+    runs = titled_runs(opened)
+    missing = opened.describe_missing()
     if as_json:
         if missing:
             sys.stderr.write(f"{missing}\n")
@@ -77,13 +80,13 @@ def statistics(
     say(f"% {missing}" if latex and missing else missing)
     tables = statistics_tables(runs, metric)
     if latex:
-        say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
+        say("\n\n".join([*latex_tables(tables), methods_paragraph(opened.manifest, runs)]))
         return
     if markdown:
         print_markdown(tables)
     else:
         print_tables(tables)
-    say(describe_controllers(folder))
+    say(describe_controllers(opened.manifest))
 
 
 def figures(
@@ -119,14 +122,15 @@ def figures(
 
     They are those of the report, with chosen kinds, controllers, names and width; nothing is simulated for them.
     """
-    from servobench.harness.batch import results
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
     from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
 
     formats = selection.split_names("format", format_, ALL_FORMATS)
     kinds = selection.split_names("kind", kind, tuple(KINDS))
-    runs = results.load_runs(folder)
-    results.check_runs(folder, runs)
+    opened = ResultsFolder(folder)
+    runs = opened.runs()
+    opened.check_runs(runs)
     known = list(dict.fromkeys(runs["controller"]))
     shown = selection.split_names("controllers", controllers, known)
     own = [name.strip() for name in names.split(",")] if names else shown
@@ -138,7 +142,7 @@ def figures(
         raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
     if "pgf" in formats:
         check_tex()
-    say(results.describe_missing(folder))
+    say(opened.describe_missing())
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
     files = []
@@ -147,16 +151,16 @@ def figures(
         accessing(target),
         writing_together(target) as partial,
     ):
-        for named in folder_figures(folder, choice):
+        for named in folder_figures(opened, choice):
             made = save_figure(named.figure, partial / named.stem, formats, exact_width=True)
             files += [target / path.name for path in made]
     if not files:
-        results.check_steps(folder)
+        opened.check_steps()
         raise ConfigurationError(
             f"{folder} has no figure of {', '.join(kinds)}: errors and paths are of moves, tracking is of curves, "
             "settling, effort and smoothness are of several runs"
         )
-    results.vouch(folder, files)
+    opened.vouch(files)
     say("\n".join(map(str, files)))
 
 
@@ -164,14 +168,16 @@ def collect(
     folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")],
 ) -> None:
     """Make the tables of a batch that was killed."""
-    from servobench.harness.batch import results
+    from servobench.harness.batch import store
     from servobench.harness.batch.lock import locked
+    from servobench.harness.batch.results import RUNS, ResultsFolder
 
-    results.check_folder(folder)
+    opened = ResultsFolder(folder)
+    opened.check_finished()
     with locked(folder):
-        count = results.collect(folder)
-    say(results.describe_missing(folder))
-    say(f"{count} runs in {folder / results.RUNS}")
+        count = store.collect(opened)
+    say(opened.describe_missing())
+    say(f"{count} runs in {folder / RUNS}")
 
 
 def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
@@ -181,12 +187,12 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     """
     from servobench.harness.batch.integrity import examine
     from servobench.harness.batch.lock import current_holder
-    from servobench.harness.batch.results import missing_line
+    from servobench.harness.batch.results import ResultsFolder, missing_line
     from servobench.plant.contract.settings import listed
 
     if (holder := current_holder(folder)) is not None:
         say(f"{folder} is being written by {holder}")
-    found = examine(folder)
+    found = examine(ResultsFolder(folder))
     for finding in found.findings:
         say(f"{folder / finding.name} {finding.fault}: {finding.remedy}")
     say(missing_line(found.runs, found.wanted))
@@ -209,20 +215,20 @@ def export(
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
     from servobench.harness.analysis.exports import export_folder
-    from servobench.harness.batch import results
+    from servobench.harness.batch.results import ResultsFolder
 
-    say(results.describe_missing(folder))
-    files = export_folder(folder, out, format_)
+    opened = ResultsFolder(folder)
+    say(opened.describe_missing())
+    files = export_folder(opened, out, format_)
     say(f"{len(files)} files in {out}")
 
 
-def print_faults(folder: Path, runs: pd.DataFrame) -> None:
+def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:
     """Print which controllers of the user's command too much, and why runs failed, a line each; the first of many."""
-    from servobench.harness.batch import results
     from servobench.harness.run.result import COMPLETED
     from servobench.plant.contract.settings import remark
 
-    own = results.read_manifest(folder).get("own_controllers", {})
+    own = folder.manifest.get("own_controllers", {})
     saturation = runs.reindex(columns=["controller", "saturation_fraction"])
     for name, share in saturation.groupby("controller").median().itertuples():
         if share > MAX_SATURATED and name in own:
@@ -233,7 +239,7 @@ def print_faults(folder: Path, runs: pd.DataFrame) -> None:
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
-def judge(folder: Path, *, strict: bool, whole: bool = True) -> None:
+def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
     """Say how many runs of a batch lack or failed and where their traces are; end with exit code 1 if that counts.
 
     Args:
@@ -241,19 +247,18 @@ def judge(folder: Path, *, strict: bool, whole: bool = True) -> None:
         strict: whether a run that failed or lacks makes the command fail.
         whole: whether the command was to carry out all runs of the batch.
     """
-    from servobench.harness.batch import results
+    from servobench.harness.batch.results import FAILURES, missing_line
     from servobench.harness.run.result import COMPLETED
 
-    completed = [
-        table["status"] == COMPLETED for table in results.iterate_runs(folder, ("status",))
-    ]
-    count, failed = sum(map(len, completed)), sum(int((~each).sum()) for each in completed)
-    lack = results.missing_line(count, results.read_manifest(folder).get("run_count", 0))
+    completed = [table["status"] == COMPLETED for table in folder.iterate_runs(("status",))]
+    count = sum(map(len, completed))
+    failed = sum(int((~each).sum()) for each in completed)
+    lack = missing_line(count, folder.run_count)
     if whole:
         say(lack)
     if failed:
         say(
-            f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder / results.FAILURES}"
+            f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder.path / FAILURES}"
         )
     if strict and (failed or (whole and lack)):
         sys.exit(FAILED)

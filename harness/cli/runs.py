@@ -164,9 +164,9 @@ def sweep(
     from servobench.harness.analysis.comparison import MISSING
     from servobench.harness.analysis.folder import describe_controllers
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, outcome_legend, sweep_tables
-    from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.plan import SweepPlan
+    from servobench.harness.batch.results import RUNS, ResultsFolder
     from servobench.harness.cli.progress import watching
     from servobench.harness.run.variations import SECTIONS
 
@@ -182,13 +182,13 @@ def sweep(
         *SWEEP_COLUMNS,
         *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)),
     )
-    legend = (
-        f"{outcome_legend(results.iterate_runs(out, columns))}\n{MISSING} as configured".lstrip()
-    )
-    print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
-    say(describe_controllers(out))
-    say(f"table in {out / results.RUNS}")
-    judge(out, strict=running.strict, whole=execution.part == (1, 1))
+    folder = ResultsFolder(out)
+    outcomes = outcome_legend(folder.iterate_runs(columns))
+    legend = f"{outcomes}\n{MISSING} as configured".lstrip()
+    print_tables(sweep_tables(folder.iterate_runs(columns)), legend)
+    say(describe_controllers(folder.manifest))
+    say(f"table in {out / RUNS}")
+    judge(folder, strict=running.strict, whole=execution.part == (1, 1))
 
 
 def merge(
@@ -201,11 +201,12 @@ def merge(
 
     The parts of compare or sweep with --part. Where runs are missing, the same call with --resume carries them out.
     """
-    from servobench.harness.batch import campaign, results
+    from servobench.harness.batch import campaign
+    from servobench.harness.batch.results import RUNS, ResultsFolder
 
     count = campaign.merge(folders, out, say)
-    say(results.describe_missing(out))
-    say(f"{count} runs in {out / results.RUNS}")
+    say(ResultsFolder(out).describe_missing())
+    say(f"{count} runs in {out / RUNS}")
 
 
 def train(
@@ -258,26 +259,27 @@ def _carry_out(
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
     from servobench.harness.analysis.folder import describe_controllers, titled_runs
     from servobench.harness.analysis.tables import summary_legend, summary_tables
-    from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.cli.progress import watching
     from servobench.harness.config.installation import missing_extra
 
     folder = out or new_folder()
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
-        runs = titled_runs(folder)
+        opened = ResultsFolder(folder)
+        runs = titled_runs(opened)
         print_tables(summary_tables(runs), summary_legend(runs))
-        say(describe_controllers(folder))
-        print_faults(folder, runs)
+        say(describe_controllers(opened.manifest))
+        print_faults(opened, runs)
         if out is None:
             point_latest(folder)
         if with_figures:
             from servobench.harness.pictures.figures import draw_figures
 
             with console.status("drawing the figures"):
-                figures = draw_figures(folder)
-                results.vouch(folder, figures)
+                figures = draw_figures(opened)
+                opened.vouch(figures)
         say(
             f"tables and {len(figures)} figures in {folder}"
             if with_figures
@@ -294,4 +296,4 @@ def _carry_out(
                     missing_extra(error, "the page") if isinstance(error, ImportError) else None
                 )
                 say(f"no report: {missing or error}")
-    judge(folder, strict=strict, whole=how.part == (1, 1))
+    judge(opened, strict=strict, whole=how.part == (1, 1))

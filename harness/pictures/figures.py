@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.folder import titled_runs
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.pictures.measures import (
     FIGURES,
     draw_conditions,
@@ -103,7 +104,7 @@ class Choice:
     title: bool = True  # whether the figures have titles
 
 
-def draw_figures(folder: Path) -> list[Path]:
+def draw_figures(folder: ResultsFolder) -> list[Path]:
     """Draw the runs of each plant and mismatch into the folder's `figures`; return the files, PNG.
 
     Raises:
@@ -111,11 +112,11 @@ def draw_figures(folder: Path) -> list[Path]:
     """
     paths: list[Path] = []
     for named in folder_figures(folder):
-        paths += save_figure(named.figure, folder / FOLDER / named.stem, ("png",))
+        paths += save_figure(named.figure, folder.path / FOLDER / named.stem, ("png",))
     return paths
 
 
-def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFigure]:
+def folder_figures(folder: ResultsFolder, choice: Choice = Choice()) -> Iterator[NamedFigure]:
     """Yield the chosen figures of a results folder, one in memory at a time.
 
     Raises:
@@ -137,7 +138,7 @@ def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFig
 
 
 def page_figures(
-    folder: Path, runs: pd.DataFrame, kinds: Collection[str]
+    folder: ResultsFolder, runs: pd.DataFrame, kinds: Collection[str]
 ) -> Iterator[tuple[NamedFigure, NamedFigure]]:
     """Yield the figures of some kinds (keys of `KINDS`) for a page, each wide and narrow; tasks one by one.
 
@@ -163,7 +164,7 @@ class _Plan(NamedTuple):
 
 
 def _folder_plans(
-    folder: Path, runs: pd.DataFrame, styles: Styles, size: int
+    folder: ResultsFolder, runs: pd.DataFrame, styles: Styles, size: int
 ) -> Iterator[tuple[Group, _Plan]]:
     """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
     if len(runs) > 1:

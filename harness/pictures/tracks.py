@@ -8,7 +8,6 @@ import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self, final
 
 import numpy as np
@@ -21,7 +20,7 @@ from servobench.harness.analysis.comparison import (
     settling_times,
     with_places,
 )
-from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -155,7 +154,7 @@ class Group:
     tasks: dict[str, Tracks]  # task -> controller -> track; tasks without any step are left out
 
 
-def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
+def load_groups(folder: ResultsFolder, runs: pd.DataFrame) -> Iterator[Group]:
     """Yield a group for each plant and mismatch of a folder's table of runs, with the runs of its smallest seed.
 
     Raises:
@@ -179,11 +178,11 @@ def track_of(row: Mapping[Any, Any], steps: pd.DataFrame) -> Track:
 
 
 def load_tracks(
-    folder: Path, runs: pd.DataFrame, columns: Collection[str] | None = None
+    folder: ResultsFolder, runs: pd.DataFrame, columns: Collection[str] | None = None
 ) -> Iterator[Track]:
     """Yield the tracks of those runs that have steps, in their order; with all columns, or those named."""
     try:
-        steps = results.load_steps(folder, runs["run_id"].tolist(), columns)
+        steps = folder.steps(runs["run_id"].tolist(), columns)
     except ConfigurationError as error:
         if type(error) is not ConfigurationError:  # a file is damaged
             raise
@@ -265,9 +264,9 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
     return np.asarray((1.0 - part) * ordered[below] + part * ordered[below + 1])
 
 
-def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
+def load_ensembles(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Ensembles]:
     """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
-    camera_moves_at = _camera_move(folder)
+    camera_moves_at = _camera_move(folder.configuration)
     tracks: dict[tuple[str, str], list[Track]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
         key = track.row["task"], track.row["controller"]
@@ -281,9 +280,8 @@ def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     return ensembles
 
 
-def _camera_move(folder: Path) -> float:
-    """Return after which share of a run the camera moves, by the manifest of a folder; NaN without one."""
-    configuration = results.read_manifest(folder).get("configuration", {})
+def _camera_move(configuration: Mapping[str, Mapping[str, Any]]) -> float:
+    """Return after which share of a run the camera moves, by the settings of a folder; NaN without one."""
     share = configuration.get("run", {}).get("camera_moves_at")
     if isinstance(share, int | float) and 0.0 <= share < 1.0:
         return share

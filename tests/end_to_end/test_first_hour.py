@@ -127,7 +127,8 @@ def reader(monkeypatch, tmp_path):
         monkeypatch.setattr("servobench.harness.batch.blocks.available_processors", lambda: 1)
         monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
         monkeypatch.setattr(
-            "servobench.harness.apps.report.page.write_report", lambda made, _: made / results.RUNS
+            "servobench.harness.apps.report.page.write_report",
+            lambda made, _: made.path / results.RUNS,
         )
     return Reader(folder, tools, monkeypatch)
 

@@ -25,6 +25,7 @@ from kit.folders import (
 from servobench.harness.analysis.comparison import FROM_TWIN, split_tasks
 from servobench.harness.apps.report.page import path_views
 from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures import style
 from servobench.harness.pictures.figures import (
@@ -53,7 +54,7 @@ OTHERS = [f"method_{i}" for i in range(20)]
 
 
 def kinds(folder):
-    return [named.kind for named in folder_figures(folder)]
+    return [named.kind for named in folder_figures(ResultsFolder(folder))]
 
 
 def legend_of(figure) -> list[str]:
@@ -95,7 +96,7 @@ def test_the_page_of_results_names_every_kind_of_figure_in_its_order():
 def test_a_comparison_gives_the_figures_of_the_paper_and_more_with_a_unit_at_every_axis_and_every_controller(
     tmp_path,
 ):
-    figures = list(folder_figures(comparison(tmp_path / "out")))
+    figures = list(folder_figures(ResultsFolder(comparison(tmp_path / "out"))))
     assert [named.kind for named in figures] == [
         "errors", "features", "paths", "tracking", "tracking_path", "jacobian", "settling", "effort", "smoothness",
         "step_times", "joint_speeds", "joint_speeds", "joint_speeds",
@@ -124,7 +125,9 @@ def test_a_comparison_gives_the_figures_of_the_paper_and_more_with_a_unit_at_eve
 
 def test_more_than_four_moves_go_into_several_figures(tmp_path):
     tasks = ("exp1", "exp2", "exp3", "exp4", "random")
-    figures = list(folder_figures(comparison(tmp_path / "out", ("ukf_mfac",), tasks)))
+    figures = list(
+        folder_figures(ResultsFolder(comparison(tmp_path / "out", ("ukf_mfac",), tasks)))
+    )
     assert [named.kind for named in figures].count("errors") == 2
     assert len({named.stem for named in figures}) == len(figures)
 
@@ -132,7 +135,11 @@ def test_more_than_four_moves_go_into_several_figures(tmp_path):
 def test_a_page_has_each_task_apart_for_a_screen_and_for_a_phone_and_nothing_is_cut(tmp_path):
     names = ("ukf_mfac", "./a_folder/my_own_controller.py:MyVeryOwnController", *OTHERS[:9])
     folder = comparison(tmp_path / "out", names, ("exp1", "exp2"))
-    figures = list(page_figures(folder, results.load_runs(folder), ("errors", "paths", "settling")))
+    figures = list(
+        page_figures(
+            ResultsFolder(folder), results.load_runs(folder), ("errors", "paths", "settling")
+        )
+    )
     assert [wide.tasks for wide, _ in figures if wide.kind == "errors"] == [("exp1",), ("exp2",)]
     assert all(wide.tasks == narrow.tasks and len(wide.tasks) == 1 for wide, narrow in figures)
     for wide, narrow in (pair for pair in figures if pair[0].tasks == ("exp1",)):
@@ -159,11 +166,11 @@ def test_a_long_name_is_broken_where_it_can_be():
 
 def test_figures_of_a_run_are_pictures_and_the_same_each_time(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
-    paths = draw_figures(folder)
+    paths = draw_figures(ResultsFolder(folder))
     assert {path.suffix for path in paths} == {".png"}
     assert len(paths) == 6
     before = {path.name: path.read_bytes() for path in paths}
-    assert before == {path.name: path.read_bytes() for path in draw_figures(folder)}
+    assert before == {path.name: path.read_bytes() for path in draw_figures(ResultsFolder(folder))}
 
 
 def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
@@ -173,7 +180,7 @@ def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
     runs.loc[0, "status"] = "feature_lost"
     short = steps[(steps["run_id"] != first) | (steps["step"] < 3)]
     write_vouched(folder, {results.RUNS: runs.to_parquet, results.STEPS: short.to_parquet})
-    figures = list(folder_figures(folder))
+    figures = list(folder_figures(ResultsFolder(folder)))
     marked = {named.kind for named in figures if ENDED in legend_of(named.figure)}
     assert {"errors", "paths", "jacobian"} <= marked
     assert any("hollow: the run ended early" in named.figure.get_supxlabel() for named in figures)
@@ -186,7 +193,7 @@ def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
     gaps.loc[5:9, ["true_feature_x_m", "feature_x_m"]] = np.nan
     rows = [made_up_row("a", controller="ukf_mfac"), made_up_row("b", controller="rbf_pid")]
     folder = write_folder(tmp_path / "out", rows, [short, gaps])
-    drawn = [drawing_of(named.figure) for named in folder_figures(folder)]
+    drawn = [drawing_of(named.figure) for named in folder_figures(ResultsFolder(folder))]
     assert drawn
     for picture, width, height in drawn:
         assert b64decode(picture).startswith(b"\x89PNG")
@@ -204,7 +211,9 @@ def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_
     exact = made_up_steps("a")
     exact["jacobian_error"] = 0.0
     folder = write_folder(tmp_path / "exact", [made_up_row("a", controller="calibrated")], [exact])
-    (figure,) = [named.figure for named in folder_figures(folder) if named.kind == "jacobian"]
+    (figure,) = [
+        named.figure for named in folder_figures(ResultsFolder(folder)) if named.kind == "jacobian"
+    ]
     assert legend_of(figure) == ["calibrated (exact)"]
 
 
@@ -220,7 +229,7 @@ def test_a_plant_with_other_features_and_joints_is_drawn_under_its_own_names(tmp
     )
     drawn = {
         named.kind: named
-        for named in folder_figures(write_folder(tmp_path / "out", [row], [steps]))
+        for named in folder_figures(ResultsFolder(write_folder(tmp_path / "out", [row], [steps])))
     }
     assert set("".join(named.stem for named in drawn.values())) <= set(
         "abcdefghijklmnopqrstuvwxyz_0123456789."
@@ -255,12 +264,14 @@ def test_half_an_hour_is_drawn_with_few_points(tmp_path):
     folder = write_folder(tmp_path / "out", [made_up_row(run_id, **kind)], [steps])
     lines = [
         line
-        for named in folder_figures(folder)
+        for named in folder_figures(ResultsFolder(folder))
         for axes in named.figure.axes
         for line in axes.get_lines()
     ]
     assert 100 < max(len(line.get_xdata()) for line in lines) <= 700
-    assert 100 < str(path_views(folder, results.load_runs(folder))).count(",") < 20_000
+    assert (
+        100 < str(path_views(ResultsFolder(folder), results.load_runs(folder))).count(",") < 20_000
+    )
 
 
 def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last_rows():
@@ -279,7 +290,7 @@ def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last
 
 @pytest.mark.parametrize(("folder", "wanted"), [(sweep, ["conditions.png"]), (failed_only, [])])
 def test_a_folder_without_steps_has_no_figures_of_them(tmp_path, folder, wanted):
-    assert [path.name for path in draw_figures(folder(tmp_path / "out"))] == wanted
+    assert [path.name for path in draw_figures(ResultsFolder(folder(tmp_path / "out")))] == wanted
     assert (tmp_path / "out" / "figures").exists() == bool(wanted)
 
 
@@ -338,7 +349,7 @@ def test_a_picture_for_a_page_keeps_the_colour_of_each_method(tmp_path):
 def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
     rows = [made_up_row(f"run{seed}", seed=seed) for seed in (7, 3, 5)]
     folder = write_folder(tmp_path / "out", rows, [made_up_steps(row["run_id"]) for row in rows])
-    (group,) = load_groups(folder, results.load_runs(folder))
+    (group,) = load_groups(ResultsFolder(folder), results.load_runs(folder))
     assert group.seed == 3
     assert group.tasks["exp1"]["ukf_mfac"].row["run_id"] == "run3"
 
@@ -371,7 +382,7 @@ def test_every_figure_of_the_report_fits_a_column_of_a_paper(monkeypatch, tmp_pa
 def test_a_figure_is_as_wide_as_a_column_of_ieeetran_or_both(tmp_path, width):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     choice = Choice(("errors",), {"ukf_mfac": "Mine"}, Layout.of_width(f"{width:g}pt"), title=False)
-    (named,) = folder_figures(folder, choice)
+    (named,) = folder_figures(ResultsFolder(folder), choice)
     (path,) = style.save_figure(named.figure, tmp_path / "errors", ("pdf",), exact_width=True)
     points = float(re.search(rb"/MediaBox \[ ?0 0 (\S+) ", path.read_bytes())[1])
     assert 72.27 / 72.0 * points == pytest.approx(width, abs=1e-3)
@@ -382,7 +393,7 @@ def test_figures_show_the_chosen_controllers_by_their_new_names_in_their_usual_s
     choice = Choice(
         ("errors",), {"rls": "UKF+MFAC", "ukf_mfac": "Mine"}, Layout.of_width("89mm"), title=False
     )
-    figures = list(folder_figures(folder, choice))
+    figures = list(folder_figures(ResultsFolder(folder), choice))
     assert [named.tasks for named in figures] == [("exp1",), ("exp2",)]
     for named in figures:
         assert named.figure.get_suptitle() == ""

@@ -22,6 +22,7 @@ from servobench.harness.batch import campaign, lock, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder
 from servobench.plant.contract.faults import ConfigurationError
 
 SWEEP = (
@@ -91,7 +92,7 @@ def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refu
     assert 0 in codes
     tables = (judged(results.load_runs(folder)) for folder in (out, tmp_path / "alone"))
     pd.testing.assert_frame_equal(*tables, check_exact=True)
-    assert examine(out).findings == []
+    assert examine(ResultsFolder(out)).findings == []
 
 
 def test_a_process_that_is_refused_waits_for_the_name_of_one_that_has_just_taken_the_lock(tmp_path):
@@ -140,7 +141,7 @@ def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed
     monkeypatch.setattr(campaign, "locked", late)
     carry_out(batch, out, how)
     assert len(results.load_runs(out)) == 4
-    assert examine(out).findings == []
+    assert examine(ResultsFolder(out)).findings == []
 
 
 @linux

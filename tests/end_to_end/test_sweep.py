@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 
 from kit.command import finish, judged, part_count, servobench, start, wait_for
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
 from servobench.harness.batch.blocks import CHUNK
 from servobench.harness.batch.plan import Batch, SweepPlan
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.run.result import NETWORKS, RunResult
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -140,10 +141,10 @@ def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(
     undisturbed, tmp_path, monkeypatch
 ):
     out = tmp_path / "half"
-    results.create_folder(out, results.read_manifest(undisturbed))
+    store.create_folder(out, ResultsFolder(undisturbed).manifest)
     rows = results.load_runs(undisturbed).to_dict("records")
     part = [RunResult(row, None) for row in rows[CHUNK : 2 * CHUNK]]
-    results.write_part(out, CHUNK, part)
+    store.write_part(out, CHUNK, part)
     assert servobench(monkeypatch, "collect", str(out)) == 0
     assert len(results.load_runs(out)) == CHUNK
     assert servobench(monkeypatch, *SWEEP, "--workers", "1", "--out", str(out), "--resume") == 0

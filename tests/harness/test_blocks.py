@@ -24,7 +24,7 @@ import pytest
 
 from kit.command import judged
 from kit.nightly import some
-from servobench.harness.batch import blocks, isolation, results
+from servobench.harness.batch import blocks, isolation, results, store
 from servobench.harness.batch.blocks import (
     Block,
     Job,
@@ -37,6 +37,7 @@ from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.isolation import Answer, End, Task, Workers
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import identity, run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -61,7 +62,7 @@ def alone(tmp_path_factory) -> pd.DataFrame:
     """The table of runs that were carried out one by one."""
     folder = tmp_path_factory.mktemp("alone") / "out"
     carry_out(CAMPAIGN, folder, Execution(1, block=1))
-    assert results.read_manifest(folder)["side_by_side"] == {}
+    assert ResultsFolder(folder).manifest["side_by_side"] == {}
     runs = results.load_runs(folder)
     assert times(runs).notna().all(axis=None)
     return judged(runs)
@@ -165,7 +166,7 @@ def test_rows_do_not_depend_on_the_blocks_and_those_of_a_block_have_no_times(
     pd.testing.assert_frame_equal(judged(runs), alone, check_exact=True)
     assert times(runs).isna().all(axis=None)
     assert set(times(runs).dtypes) == {np.dtype(float)}
-    manifest = results.read_manifest(tmp_path / "out")
+    manifest = ResultsFolder(tmp_path / "out").manifest
     assert manifest["side_by_side"] == {"kinematic": ["constant", "broyden"]}
     assert manifest["seeds"] == "0:6"
 
@@ -176,7 +177,7 @@ def test_runs_that_are_missing_may_form_other_blocks(alone, tmp_path):
     rows = results.load_runs(folder).to_dict("records")
     (folder / results.RUNS).unlink()
     (folder / results.PARTS).mkdir()
-    results.write_part(folder, 3, [RunResult(row, None) for row in rows[3:8]])
+    store.write_part(folder, 3, [RunResult(row, None) for row in rows[3:8]])
     carry_out(CAMPAIGN, folder, Execution(1, block=4, resume=True))
     pd.testing.assert_frame_equal(judged(results.load_runs(folder)), alone, check_exact=True)
 

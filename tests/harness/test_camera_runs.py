@@ -10,7 +10,7 @@ import servobench as package
 from kit.lanes import assert_rows_of_single_runs
 from servobench.harness.apps.films.replay import logged_run
 from servobench.harness.apps.studies.challenge import find_challenge
-from servobench.harness.batch.results import read_manifest
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import starts
 from servobench.harness.run.episode import run_experiment
@@ -99,7 +99,7 @@ def test_a_circle_is_within_the_image_and_leads_through_where_the_target_is(sens
 def test_a_folder_tells_its_camera():
     asked = {"sensings": ["pixel:hand"], "robot": WORD, "settings": {"random": {"duration": 0.5}}}
     package.compare(["constant"], tasks=["random"], out="out", **asked)
-    manifest = read_manifest(Path("out"))
+    manifest = ResultsFolder(Path("out")).manifest
     assert manifest["robots"][0]["camera"]["pose"]["position"] == [0.0, -0.07, 0.05]
     assert manifest["configuration"]["kinematic"]["sensing.frame_period"] == 1.0 / 15.0
 

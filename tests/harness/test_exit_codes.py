@@ -104,7 +104,7 @@ def test_a_full_disk_is_one_line(call, monkeypatch, capsys):
     def write(*_: object) -> None:
         raise OSError(errno.ENOSPC, "Error writing bytes to file")
 
-    monkeypatch.setattr("servobench.harness.batch.results.write_part", write)
+    monkeypatch.setattr("servobench.harness.batch.store.write_part", write)
     assert call(*SWEEP, "constant") == 1
     assert capsys.readouterr().err == (
         "servobench: No space left on device (in the temporary folder or in the one that is written); finished runs "

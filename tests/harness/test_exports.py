@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 
 from servobench.harness.analysis.exports import export_folder
 from servobench.harness.batch.api import compare, load
+from servobench.harness.batch.results import ResultsFolder
 from servobench.plant.contract.faults import ConfigurationError
 
 
@@ -26,7 +27,7 @@ def folder(tmp_path_factory):
 
 
 def test_csv_holds_every_digit_of_every_run(folder, tmp_path):
-    files = export_folder(folder, tmp_path / "csv", "csv")
+    files = export_folder(ResultsFolder(folder), tmp_path / "csv", "csv")
     assert [file.suffix for file in files] == [".csv"] * 3
     whole = load(folder).steps
     for name, steps in whole.groupby("run_id"):
@@ -41,7 +42,7 @@ def test_csv_holds_every_digit_of_every_run(folder, tmp_path):
 
 
 def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
-    export_folder(folder, tmp_path / "mcap", "mcap")
+    export_folder(ResultsFolder(folder), tmp_path / "mcap", "mcap")
     runs, whole = load(folder).runs, load(folder).steps
     for run in runs.to_dict("records"):
         steps = whole[whole["run_id"] == run["run_id"]]
@@ -65,6 +66,6 @@ def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
 
 def test_what_cannot_be_exported_is_one_line(folder, tmp_path):
     with pytest.raises(ConfigurationError, match="format must be one of csv, mcap, got 'xls'"):
-        export_folder(folder, tmp_path / "xls", "xls")
+        export_folder(ResultsFolder(folder), tmp_path / "xls", "xls")
     with pytest.raises(ConfigurationError, match="exists already; name a new folder"):
-        export_folder(folder, tmp_path, "csv")
+        export_folder(ResultsFolder(folder), tmp_path, "csv")

@@ -13,7 +13,8 @@ from kit.command import no_file_above
 from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import Estimate
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import draw_joint_motion, draw_moves, draw_tracking
@@ -32,7 +33,7 @@ STYLES = method_styles(METHODS)
 
 def load(folder, rows, steps):
     write_folder(folder, rows, steps)
-    return load_ensembles(folder, results.load_runs(folder))
+    return load_ensembles(ResultsFolder(folder), results.load_runs(folder))
 
 
 def seeds_of(folder, factors, name="ukf_mfac", task="exp1", **values):
@@ -121,11 +122,11 @@ def test_a_camera_that_moved_is_marked_and_the_whole_move_is_shown(tmp_path, mis
     write_folder(
         tmp_path, [made_up_row("a", mismatch=mismatch, mismatch_values=drawn)], [made_up_steps("a")]
     )
-    manifest = results.read_manifest(tmp_path) | {
+    manifest = ResultsFolder(tmp_path).manifest | {
         "configuration": {"run": {"camera_moves_at": 0.5}}
     }
-    results.write_manifest(tmp_path, manifest)
-    ensembles = load_ensembles(tmp_path, results.load_runs(tmp_path))
+    store.write_manifest(tmp_path, manifest)
+    ensembles = load_ensembles(ResultsFolder(tmp_path), results.load_runs(tmp_path))
     assert shown_until(ensembles["exp1"]) == 59 * 0.05
     axes = draw_moves(ensembles, STYLES).axes[0]
     assert lines_of(axes, "camera moves")[0].get_xdata()[0] == 1.5

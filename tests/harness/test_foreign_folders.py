@@ -20,7 +20,8 @@ import pytest
 from kit.command import servobench
 from kit.folders import MANIFEST, comparison, made_up_row, made_up_steps, write_folder
 from kit.writes import noting
-from servobench.harness.batch import results, tables
+from servobench.harness.batch import results, store, tables
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract import files
 from servobench.plant.contract.checksums import SUMS, write_vouched
@@ -56,9 +57,9 @@ def row(**values: object) -> dict[str, object]:
 
 def signed(folder: Path, **values: object) -> Path:
     """Write an unfinished folder with one run and with checksums that fit."""
-    results.create_folder(folder, MANIFEST | {"run_count": 2})
+    store.create_folder(folder, MANIFEST | {"run_count": 2})
     run = row() | values
-    results.write_part(folder, 0, [RunResult(run, made_up_steps(str(run["run_id"]), periods=5))])
+    store.write_part(folder, 0, [RunResult(run, made_up_steps(str(run["run_id"]), periods=5))])
     return folder
 
 
@@ -168,8 +169,8 @@ def test_a_run_that_is_called_as_the_table_of_runs_is_refused_by_every_command(
 
 def test_parts_with_the_same_run_are_not_merged(refusal_of, tmp_path):
     one = signed(tmp_path / "one")
-    results.create_folder(tmp_path / "two", MANIFEST | {"run_count": 2})
-    results.write_part(tmp_path / "two", 1, [RunResult(row() | {"run_id": RUN.upper()}, None)])
+    store.create_folder(tmp_path / "two", MANIFEST | {"run_count": 2})
+    store.write_part(tmp_path / "two", 1, [RunResult(row() | {"run_id": RUN.upper()}, None)])
     line = refusal_of("merge", one, tmp_path / "two", "--out", tmp_path / "out")
     assert "rows 0 and 1 have the run_id" in line
     assert not (tmp_path / "out").exists()
@@ -263,7 +264,7 @@ def rewritten(
 
 
 def manifest(**values: object) -> Callable[[Path], object]:
-    return lambda folder: results.write_manifest(folder, results.read_manifest(folder) | values)
+    return lambda folder: store.write_manifest(folder, ResultsFolder(folder).manifest | values)
 
 
 def lists_in_lists(folder: Path) -> None:
@@ -302,7 +303,7 @@ def differing_parts(folder: Path) -> None:
     (folder / results.PARTS).mkdir()
     for index, value in enumerate((0.5, True)):
         run = row() | {"run_id": f"b{index}"}
-        results.write_part(
+        store.write_part(
             folder, index, [RunResult(run, made_up_steps(f"b{index}").assign(jacobian_error=value))]
         )
     for name in (results.RUNS, results.STEPS):

@@ -84,7 +84,7 @@ def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
     def interrupt(folder):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("servobench.harness.batch.results.check_folder", interrupt)
+    monkeypatch.setattr("servobench.harness.batch.results.ResultsFolder.check_finished", interrupt)
     assert servobench(monkeypatch, "collect", ".") == 130
     assert capsys.readouterr().err == "servobench: interrupted\n"
 

@@ -11,11 +11,12 @@ import pytest
 
 from kit.command import judged, servobench
 from kit.folders import made_up_row
-from servobench.harness.batch import results, tables
+from servobench.harness.batch import results, store, tables
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.batch.tables import DamagedFile
 from servobench.harness.config.settings import Settings
 from servobench.plant.contract.checksums import SUMS, fault, read_sums
@@ -67,7 +68,7 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "out"
     run(folder)
     assert results.load_runs(folder)["status"].nunique() > 1
-    found = examine(folder)
+    found = examine(ResultsFolder(folder))
     assert (found.findings, found.runs, found.wanted) == ([], RUNS, RUNS)
     assert found.files == 3  # runs, failures, manifest
     return folder
@@ -81,22 +82,22 @@ def test_verify_covers_the_files_beside_the_tables_and_names_the_rest(
     for name in ("figures/paths.png", "report.html"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(name)
-    results.vouch(folder, [folder / "figures" / "paths.png", folder / "report.html"])
+    ResultsFolder(folder).vouch([folder / "figures" / "paths.png", folder / "report.html"])
     (folder / "notes.txt").write_text("mine")
     run(folder / "inside", seeds=range(2))
-    found = examine(folder)
+    found = examine(ResultsFolder(folder))
     assert (found.findings, found.left_out) == ([], ["inside/", "notes.txt"])
     assert "not checked, as SHA256SUMS does not list it: inside/, notes.txt\n" in output_of(
         "verify", folder
     )
     (folder / "figures" / "paths.png").unlink()
     (folder / "report.html").write_text("other")
-    assert [(each.name, each.fault) for each in examine(folder).findings] == [
+    assert [(each.name, each.fault) for each in examine(ResultsFolder(folder)).findings] == [
         ("figures/paths.png", "is missing"), ("report.html", "was changed since it was written"),
     ]  # fmt: skip
     assert servobench(monkeypatch, "verify", str(folder)) == 1
     run(folder, resume=True, steps=True)  # leaves the lines of these files as they are
-    assert len(examine(folder).findings) == 2
+    assert len(examine(ResultsFolder(folder)).findings) == 2
 
 
 def test_networks_of_a_batch_are_vouched_for_when_it_ends(tmp_path):
@@ -105,18 +106,20 @@ def test_networks_of_a_batch_are_vouched_for_when_it_ends(tmp_path):
         run(folder, Stop())
     (folder / "networks").mkdir()
     (folder / "networks" / "networks-1.npz").write_bytes(b"1")
-    assert examine(folder).left_out == ["networks/networks-1.npz"]
+    assert examine(ResultsFolder(folder)).left_out == ["networks/networks-1.npz"]
     run(folder, resume=True)
-    assert examine(folder).left_out == []
+    assert examine(ResultsFolder(folder)).left_out == []
     (folder / "networks" / "networks-1.npz").write_bytes(b"2")
-    assert [each.name for each in examine(folder).findings] == ["networks/networks-1.npz"]
+    assert [each.name for each in examine(ResultsFolder(folder)).findings] == [
+        "networks/networks-1.npz"
+    ]
 
 
 def test_resume_begins_a_batch_whose_folder_was_never_made(tmp_path):
     begun = run(tmp_path / "never", resume=True)
     assert begun.repeated == RUNS
     assert f"{tmp_path / 'never'} holds no runs to continue; all are carried out" in begun.notes
-    assert examine(tmp_path / "never").runs == RUNS
+    assert examine(ResultsFolder(tmp_path / "never")).runs == RUNS
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +127,7 @@ def half(tmp_path_factory):
     folder = tmp_path_factory.mktemp("half") / "out"
     with pytest.raises(KeyboardInterrupt):
         run(folder, Stop())
-    assert examine(folder).runs == RUNS - 8
+    assert examine(ResultsFolder(folder)).runs == RUNS - 8
     return folder
 
 
@@ -150,7 +153,7 @@ def assert_same(folder, whole):
     pd.testing.assert_frame_equal(
         judged(results.load_runs(folder)), judged(results.load_runs(whole)), check_exact=True
     )
-    assert examine(folder).findings == []
+    assert examine(ResultsFolder(folder)).findings == []
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         path.name for path in whole.iterdir()
     )
@@ -166,23 +169,23 @@ DAMAGES = {
 
 def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damaged(begun, tmp_path):
     folder, other = begun, tmp_path / "other"
-    results.create_folder(other, {"schema_version": "4"})
-    results.copy_parts([(folder, 0), (folder, 8)], other)
-    assert results.part_indices(other) == [0, 8]
+    store.create_folder(other, {"schema_version": "4"})
+    store.copy_parts([(ResultsFolder(folder), 0), (ResultsFolder(folder), 8)], other)
+    assert ResultsFolder(other).part_indices() == [0, 8]
     assert not (other / results.PICTURES).exists()
     runs = pd.read_parquet(folder / results.part_name(0, results.RUNS))["run_id"]
     (folder / results.PICTURES).mkdir()
     for name in (runs[0], "another"):
         (folder / results.PICTURES / f"{name}.png").write_text(name)
     for _ in range(2):
-        results.copy_parts([(folder, 0)], other)
+        store.copy_parts([(ResultsFolder(folder), 0)], other)
         assert [path.name for path in (other / results.PICTURES).iterdir()] == [f"{runs[0]}.png"]
     assert {results.part_name(0, results.RUNS), f"{results.PICTURES}/{runs[0]}.png"} <= read_sums(
         other
     ).keys()
     flip(folder / results.part_name(8, results.RUNS))
     with pytest.raises(DamagedFile, match=r"00000008\.runs\.parquet was changed"):
-        results.copy_parts([(folder, 8)], other)
+        store.copy_parts([(ResultsFolder(folder), 8)], other)
 
 
 def test_more_runs_than_were_asked_for_are_of_another_folder():
@@ -198,13 +201,13 @@ def test_more_runs_than_were_asked_for_are_of_another_folder():
 def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(begun, whole, what):
     part = begun / results.part_name(8, results.RUNS)
     DAMAGES[what](part)
-    for command in (results.load_runs, results.collect):
+    for command in (ResultsFolder.runs, store.collect):
         with pytest.raises(
             DamagedFile,
             match=rf"00000008\.runs\.parquet {what}; repeat .* --resume, or type: servob",
         ):
-            command(begun)
-    found = examine(begun)
+            command(ResultsFolder(begun))
+    found = examine(ResultsFolder(begun))
     (finding,) = found.findings
     assert (finding.name, finding.fault) == (results.part_name(8, results.RUNS), what)
     assert found.runs == RUNS - 16
@@ -217,18 +220,20 @@ def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(begun, wh
 def test_a_part_with_the_rows_of_another_is_refused(begun, whole):
     first, second = (begun / results.part_name(index, results.RUNS) for index in (0, 8))
     shutil.copy(first, second)
-    assert [finding.fault for finding in examine(begun).findings] == [
+    assert [finding.fault for finding in examine(ResultsFolder(begun)).findings] == [
         "was changed since it was written"
     ]
     (begun / SUMS).unlink()  # nothing vouches for it, but it says itself which rows it holds
-    assert "holds the rows of other runs" in [finding.fault for finding in examine(begun).findings]
+    assert "holds the rows of other runs" in [
+        finding.fault for finding in examine(ResultsFolder(begun)).findings
+    ]
     assert run(begun, resume=True).repeated == 16
     assert_same(begun, whole)
 
 
 def test_parts_without_checksums_are_read_and_kept(begun, whole):
     (begun / SUMS).unlink()
-    (finding,) = examine(begun).findings
+    (finding,) = examine(ResultsFolder(begun)).findings
     assert (finding.name, finding.fault) == (
         SUMS,
         "is missing, so that nothing vouches for the other files",
@@ -245,8 +250,8 @@ def test_a_damaged_table_is_named_and_made_again(ended, whole, what):
     with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
         results.load_runs(ended)
     with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
-        results.collect(ended)
-    (finding,) = examine(ended).findings
+        store.collect(ResultsFolder(ended))
+    (finding,) = examine(ResultsFolder(ended)).findings
     assert finding.remedy.endswith("--resume; runs that are in no part are repeated")
     resumed = run(ended, resume=True)
     assert resumed.repeated == RUNS
@@ -272,7 +277,7 @@ def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repea
 def test_a_file_that_lost_its_line_is_vouched_for_again(ended, whole, name):
     lines = (ended / SUMS).read_text().splitlines(keepends=True)
     (ended / SUMS).write_text("".join(line for line in lines if not line.endswith(f"  {name}\n")))
-    named = [(each.name, each.fault) for each in examine(ended).findings]
+    named = [(each.name, each.fault) for each in examine(ResultsFolder(ended)).findings]
     assert named == [(name, f"is not listed in {SUMS}")]
     assert run(ended, resume=True).repeated == (0 if name == results.MANIFEST else RUNS)
     assert fault(ended, name, read_sums(ended)) is None
@@ -305,7 +310,7 @@ def test_what_is_lost_beside_whole_tables_is_written_anew_without_a_run(
     ended, whole, name, damage, note
 ):
     damage(ended / name)
-    (finding,) = examine(ended).findings
+    (finding,) = examine(ResultsFolder(ended)).findings
     assert finding.name == name
     resumed = run(ended, resume=True)
     assert (resumed.repeated, resumed.notes) == (0, [f"{ended / name} {note}"])
@@ -323,7 +328,9 @@ def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for
     ).write_bytes(content)
     with pytest.raises(ConfigurationError, match=r"manifest\.json"):
         results.load_runs(begun)
-    assert [finding.name for finding in examine(begun).findings] == [results.MANIFEST]
+    assert [finding.name for finding in examine(ResultsFolder(begun)).findings] == [
+        results.MANIFEST
+    ]
     with pytest.raises(ConfigurationError, match="are not of this batch or do not say so"):
         run(begun, resume=True, seeds=range(5))
     assert run(begun, resume=True).repeated == 8
@@ -365,13 +372,13 @@ def test_a_manifest_of_wrong_types_is_one_line(ended, key, value, wanted):
     (ended / SUMS).unlink()
     manifest = json.loads((ended / results.MANIFEST).read_text()) | {key: value}
     (ended / results.MANIFEST).write_text(json.dumps(manifest))
-    for command in (results.load_runs, results.collect):
+    for command in (ResultsFolder.runs, store.collect):
         shown = re.escape(repr(str(value)[:60]))
         with pytest.raises(
             ConfigurationError,
             match=f"manifest.json is damaged: {key} must be {wanted}, got {shown};",
         ):
-            command(ended)
+            command(ResultsFolder(ended))
 
 
 def test_stray_files_are_named_and_count_for_nothing(begun, whole):
@@ -379,9 +386,11 @@ def test_stray_files_are_named_and_count_for_nothing(begun, whole):
     for name in ("1x.runs.parquet", "0.runs.parquet", "notes.txt"):
         shutil.copy(part, begun / results.PARTS / name)
     assert len(results.load_runs(begun)) == RUNS - 8
-    assert {finding.fault for finding in examine(begun).findings} == {"is no file of a batch"}
+    assert {finding.fault for finding in examine(ResultsFolder(begun)).findings} == {
+        "is no file of a batch"
+    }
     shutil.copy(part, begun / results.part_name(20, results.RUNS))
-    assert examine(begun).findings[0].fault == "is not listed in SHA256SUMS"
+    assert examine(ResultsFolder(begun)).findings[0].fault == "is not listed in SHA256SUMS"
     assert run(begun, resume=True).repeated == 8
     assert_same(begun, whole)
 
@@ -393,7 +402,7 @@ def test_files_that_a_killed_process_had_begun_are_removed(begun, whole):
     ]
     for path in partial:
         path.write_bytes(b"half")
-    assert examine(begun).findings == []
+    assert examine(ResultsFolder(begun)).findings == []
 
     class Look(Notes):
         def finished(self, rows) -> None:
@@ -430,7 +439,7 @@ def test_steps_that_are_damaged_or_missing_make_their_part_count_no_more(tmp_pat
 @pytest.mark.parametrize("name", [results.RUNS, results.FAILURES, results.MANIFEST])
 def test_a_file_that_is_gone_is_named(ended, name):
     (ended / name).unlink()
-    found = [(each.name, each.fault) for each in examine(ended).findings]
+    found = [(each.name, each.fault) for each in examine(ResultsFolder(ended)).findings]
     assert found == [(name, "is missing")]
 
 
@@ -440,7 +449,7 @@ def test_rows_that_the_part_before_has_too_are_named_where_nothing_vouches_for_t
     for index in (8, 12):
         (begun / results.part_name(index, results.RUNS)).unlink(missing_ok=True)
         tables.write_table(rows, begun / results.part_name(index, results.RUNS))
-    named = {each.name: each.fault for each in examine(begun).findings}
+    named = {each.name: each.fault for each in examine(ResultsFolder(begun)).findings}
     assert (
         named[results.part_name(12, results.RUNS)] == "holds runs that the part before it has, too"
     )

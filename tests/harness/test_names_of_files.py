@@ -10,6 +10,7 @@ from kit.robots import FOUR_JOINTS
 from servobench.harness.apps.studies.challenge import FOLDER, find_challenge
 from servobench.harness.batch import results
 from servobench.harness.batch.logs import logged_in_file
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import choose_controller, choose_plant, is_foreign_plant
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import read_settings
@@ -150,7 +151,7 @@ def test_an_fmu_has_the_name_that_a_user_gives_it(output_of):
         for name in ("mine", "rbf_pid:published")
     )
     assert own == pytest.approx(original, rel=1e-9)
-    manifest = results.read_manifest(Path("runs"))
+    manifest = ResultsFolder(Path("runs")).manifest
     assert manifest["own_controllers"]["mine"]["place"] == "fmu:pilot,1.FMU"
     assert "pilot,1.FMU" in manifest["files"]
 

@@ -1,7 +1,5 @@
 """The tables of a page, whose answers are known."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,7 +13,8 @@ from servobench.harness.analysis.folder import (
     describe_settings,
 )
 from servobench.harness.analysis.verdict import leaders
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.pictures.measures import FIGURES
 from servobench.harness.run.metrics import METRICS
 
@@ -185,16 +184,18 @@ def test_every_table_of_every_kind_of_folder_is_text_without_pythons_words(tmp_p
     assert not {"nan", "inf", "None", "NaN"} & {
         word.strip("[],") for cell in cells for word in cell.split()
     }
-    assert describe_folder(path, runs)["runs"].startswith(f"{len(runs)}, of which ")
+    assert describe_folder(ResultsFolder(path).manifest, runs)["runs"].startswith(
+        f"{len(runs)}, of which "
+    )
 
 
 def test_settings_are_told_in_words(tmp_path):
     folder = comparison(tmp_path / "out")
-    manifest = results.read_manifest(folder)
-    assert describe_settings(folder) == {}
+    opened = ResultsFolder(folder)
+    assert describe_settings(opened.configuration) == {}
     limits = {"limit": "inf", "gain": 0.5, "view": False, "bounds": [1, None]}
-    results.write_manifest(folder, manifest | {"configuration": {"law": limits}})
-    assert describe_settings(folder) == {
+    store.write_manifest(folder, opened.manifest | {"configuration": {"law": limits}})
+    assert describe_settings(ResultsFolder(folder).configuration) == {
         "law.limit": "no limit", "law.gain": "0.5", "law.view": "no", "law.bounds": "1, not set",
     }  # fmt: skip
 
@@ -253,7 +254,7 @@ def test_every_place_that_a_metric_names_exists():
         assert metric.figure in ("", *FIGURES), metric.column
 
 
-def test_a_folder_says_which_of_its_controllers_have_the_aids(monkeypatch):
+def test_a_folder_says_which_of_its_controllers_have_the_aids():
     every = {f"aids.{name}": value for name, value in EQUIPPED.items()}
     sections = {
         "ukf_mfac": every,
@@ -265,8 +266,7 @@ def test_a_folder_says_which_of_its_controllers_have_the_aids(monkeypatch):
         "controllers": ["ukf_mfac", "Mine", "ukf_mpc", "fmu:a.fmu"],
         "configuration": sections | {"fmu:a.fmu": {}},
     }
-    monkeypatch.setattr(results, "read_manifest", lambda _: manifest)
     wanted = "with all aids: ukf_mfac; without aids: Mine; with all aids but limit: ukf_mpc; aids unknown: fmu:a.fmu"
-    assert describe_controllers(Path()) == wanted
+    assert describe_controllers(manifest) == wanted
     manifest["controllers"] = ["Mine"]
-    assert describe_controllers(Path()) == ""
+    assert describe_controllers(manifest) == ""

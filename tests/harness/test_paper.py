@@ -16,7 +16,7 @@ from servobench.harness.analysis.folder import (
 )
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch.api import compare
-from servobench.harness.batch.results import load_runs, load_steps
+from servobench.harness.batch.results import ResultsFolder, load_runs, load_steps
 from servobench.harness.pictures.figures import Choice, folder_figures
 
 TABLE = pd.DataFrame(
@@ -77,7 +77,9 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
 
 def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     folder = sweep(tmp_path / "sweep")
-    assert ". Varied: latency [ms] 0, 50. " in methods_paragraph(folder, load_runs(folder))
+    assert ". Varied: latency [ms] 0, 50. " in methods_paragraph(
+        ResultsFolder(folder).manifest, load_runs(folder)
+    )
 
 
 def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path):
@@ -88,15 +90,15 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     compare(
         ["constant"], tasks=["exp2"], robot=str(twin), mismatches=["none"], settings=short, out=out
     )
-    runs = titled_runs(out)
-    text = methods_paragraph(out, runs)
+    runs = titled_runs(ResultsFolder(out))
+    text = methods_paragraph(ResultsFolder(out).manifest, runs)
     assert (
         "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. "
         in text
     )
-    (drawn,) = folder_figures(out, Choice(["errors"]))
+    (drawn,) = folder_figures(ResultsFolder(out), Choice(["errors"]))
     assert drawn.title.endswith("kinematic, mismatch drawn from the twin, seed 0")
-    assert describe_folder(out, runs)["mismatch"] == "drawn from the twin"
+    assert describe_folder(ResultsFolder(out).manifest, runs)["mismatch"] == "drawn from the twin"
     assert [title for title, _ in statistics_tables(runs)] == [
         "exp2 on kinematic, drawn from the twin"
     ]

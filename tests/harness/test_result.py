@@ -14,7 +14,8 @@ from kit.folders import made_up_row
 from kit.resting import Resting
 from kit.toy_plants import Plain
 from servobench.controllers.controller import Controller, RobotKnowledge
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.source import PACKAGE_FOLDER
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.result import Ending, RunResult, log_entry
@@ -171,12 +172,12 @@ def test_good_runs_leave_no_log(tmp_path):
 
 def test_an_interrupted_batch_that_is_resumed_has_the_log_of_all_runs(tmp_path):
     folder, rows = tmp_path / "out", []
-    results.create_folder(folder, {"run_count": 2})
+    store.create_folder(folder, {"run_count": 2})
     for i in range(2):
         row = made_up_row(f"run{i}", seed=i, status="crashed", reason=f"no {i}")
         rows.append(log_entry(row, "a\nb"))
-        results.write_part(folder, i, [RunResult(row, None, trace="a\nb")])
-        results.collect(folder)
+        store.write_part(folder, i, [RunResult(row, None, trace="a\nb")])
+        store.collect(ResultsFolder(folder))
         assert (folder / results.FAILURES).read_text() == "".join(rows)
 
 

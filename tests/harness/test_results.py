@@ -28,8 +28,10 @@ from servobench.harness.analysis.tables import (
 )
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.apps.report.page import error_curves, path_views
-from servobench.harness.batch import results, tables
+from servobench.harness.batch import results, store, tables
 from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.schema import MANIFEST, read_manifest
 from servobench.harness.batch.tables import NEEDED
 from servobench.harness.cli.runs import new_folder
 from servobench.harness.pictures.measures import draw_conditions
@@ -48,13 +50,13 @@ def add_part(folder, index: int, **extra: float) -> None:
     steps = pd.DataFrame(
         {"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | STEPS | extra
     )
-    results.write_part(folder, index, [RunResult(made_up_row(run_id, seed=index) | extra, steps)])
+    store.write_part(folder, index, [RunResult(made_up_row(run_id, seed=index) | extra, steps)])
 
 
 @pytest.fixture
 def folder(tmp_path):
     made = tmp_path / "out"
-    results.create_folder(made, {"seeds": "0"})
+    store.create_folder(made, {"seeds": "0"})
     return made
 
 
@@ -73,19 +75,64 @@ def test_parts_are_readable_before_and_after_they_are_put_together(folder):
     for index in (1, 0):
         add_part(folder, index)
     before = results.load_runs(folder), results.load_steps(folder)
-    assert results.collect(folder) == 2
+    assert store.collect(ResultsFolder(folder)) == 2
     after = results.load_runs(folder), results.load_steps(folder)
     for early, late in zip(before, after, strict=True):
         pd.testing.assert_frame_equal(early, late)
     assert before[0]["run_id"].tolist() == ["run0", "run1"]
     assert not (folder / results.PARTS).exists()
-    assert results.collect(folder) == 2
+    assert store.collect(ResultsFolder(folder)) == 2
+
+
+def test_an_opened_folder_reads_its_manifest_once(folder, monkeypatch):
+    read = []
+
+    def counted(path):
+        read.append(path)
+        return read_manifest(path)
+
+    monkeypatch.setattr(results, "read_manifest", counted)
+    opened = ResultsFolder(folder)
+    with pytest.raises(ConfigurationError, match="out holds no finished run"):
+        opened.runs()
+    add_part(folder, 0)
+    assert opened.runs()["run_id"].tolist() == ["run0"]
+    assert opened.steps()["step"].tolist() == [0, 1, 2]
+    assert (opened.describe_missing(), opened.run_count, opened.configuration) == ("", 0, {})
+    assert read == [folder]
+
+
+def test_an_opened_folder_follows_a_batch_that_is_under_way(folder):
+    opened = ResultsFolder(folder)
+    add_part(folder, 0)
+    assert opened.finished_runs() == [range(1)]
+    add_part(folder, 1)
+    assert opened.finished_runs() == [range(1), range(1, 2)]
+    assert (opened.part_indices(), opened.is_whole(2)) == ([0, 1], False)
+    assert store.collect(ResultsFolder(folder)) == 2
+    assert (opened.part_indices(), opened.is_whole(2), opened.is_whole(3)) == ([], True, False)
+    assert opened.runs()["run_id"].tolist() == ["run0", "run1"]
+    assert sorted(opened.sums) == [MANIFEST, results.RUNS, results.STEPS]
+
+
+def test_an_opened_folder_names_a_file_that_was_changed_meanwhile(folder):
+    opened = ResultsFolder(folder)
+    add_part(folder, 0)
+    opened.runs()
+    name = results.part_name(0, results.RUNS)
+    assert (opened.fault_of(name), opened.expects(name)) == (None, True)
+    (folder / name).unlink()
+    assert (opened.fault_of(name), opened.expects(name)) == ("is missing", True)
+    (folder / "mine.txt").write_text("a note")
+    assert (opened.unlisted(), opened.accompanying()) == (["mine.txt"], {})
+    opened.vouch([folder / "mine.txt"])
+    assert (opened.unlisted(), list(opened.accompanying())) == ([], ["mine.txt"])
 
 
 def test_tables_have_the_columns_that_were_written_and_no_others(folder):
     steps = pd.DataFrame({"run_id": "run0", "step": np.arange(3)} | STEPS, index=[7, 8, 9])
     outcome = [RunResult(made_up_row(name), steps.assign(run_id=name)) for name in ("run0", "run1")]
-    results.write_part(folder, 0, outcome)
+    store.write_part(folder, 0, outcome)
     assert list(results.load_steps(folder)) == list(steps)
     assert list(results.load_runs(folder)) == list(made_up_row("run0"))
 
@@ -96,16 +143,16 @@ def test_a_folder_that_a_killed_batch_had_begun_to_make_is_made(tmp_path):
     half = begun / f".{results.MANIFEST}-12-34"
     half.write_text("{")
     (begun / SUMS).write_text("of another time")
-    results.create_folder(begun, {"seeds": "0"})
+    store.create_folder(begun, {"seeds": "0"})
     assert not half.exists()
-    assert results.read_manifest(begun)["seeds"] == "0"
-    assert not examine(begun).findings
+    assert ResultsFolder(begun).manifest["seeds"] == "0"
+    assert not examine(ResultsFolder(begun)).findings
 
 
 def test_tables_with_different_columns_join_with_gaps(folder):
     add_part(folder, 0)
     add_part(folder, 1, torque=2.5)
-    results.collect(folder)
+    store.collect(ResultsFolder(folder))
     steps = results.load_steps(folder)
     assert steps["torque"].isna().tolist() == [True] * 3 + [False] * 3
     assert results.load_steps(folder, ["run1"])["torque"].tolist() == [2.5] * 3
@@ -116,13 +163,13 @@ def test_a_run_without_its_row_does_not_count(folder):
     add_part(folder, 1)
     (folder / results.PARTS / f"00000001.{results.RUNS}").unlink()
     (folder / results.PARTS / f".00000002.{results.RUNS}").write_bytes(b"half")
-    assert results.collect(folder) == 1
+    assert store.collect(ResultsFolder(folder)) == 1
     assert results.load_steps(folder)["run_id"].unique().tolist() == ["run0"]
 
 
 def test_a_run_that_ended_before_its_first_period_has_a_row_and_no_steps(folder):
-    results.write_part(folder, 0, [RunResult(made_up_row("run0"), pd.DataFrame())])
-    assert results.collect(folder) == 1
+    store.write_part(folder, 0, [RunResult(made_up_row("run0"), pd.DataFrame())])
+    assert store.collect(ResultsFolder(folder)) == 1
     with pytest.raises(ConfigurationError, match="holds no steps"):
         results.load_steps(folder)
 
@@ -131,11 +178,11 @@ def test_a_killed_clean_up_loses_nothing(folder):
     add_part(folder, 0)
     add_part(folder, 1)
     parts = {path.name: path.read_bytes() for path in (folder / results.PARTS).iterdir()}
-    results.collect(folder)
+    store.collect(ResultsFolder(folder))
     (folder / results.PARTS).mkdir()
     name = f"00000001.{results.RUNS}"
     (folder / results.PARTS / name).write_bytes(parts[name])
-    assert results.collect(folder) == 2
+    assert store.collect(ResultsFolder(folder)) == 2
     assert not (folder / results.PARTS).exists()
     assert len(results.load_runs(folder)) == 2
 
@@ -147,7 +194,7 @@ def test_a_killed_clean_up_loses_nothing(folder):
 def test_a_folder_with_something_in_it_or_that_cannot_be_made_is_refused(tmp_path, name, message):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(ConfigurationError, match=message):
-        results.create_folder(tmp_path / name, {})
+        store.create_folder(tmp_path / name, {})
 
 
 def test_a_folder_of_another_schema_is_refused(folder):
@@ -209,7 +256,7 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path, 
 def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder):
     point_latest(folder)
     newer = folder.parent / "newer"
-    results.create_folder(newer, {})
+    store.create_folder(newer, {})
     point_latest(newer)
     assert (folder.parent / "latest").resolve() == newer.resolve()
     (folder.parent / "latest").unlink()
@@ -219,7 +266,7 @@ def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder
 
 
 def test_the_manifest_is_json_for_every_reader(tmp_path):
-    results.create_folder(
+    store.create_folder(
         tmp_path / "out", {"limit": float("inf"), "low": (1.5, float("-inf")), "count": 3}
     )
     text = (tmp_path / "out" / results.MANIFEST).read_text(encoding="utf-8")
@@ -230,11 +277,11 @@ def test_the_manifest_is_json_for_every_reader(tmp_path):
 
 def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(folder):
     for index, latency in enumerate((None, 2, None)):
-        results.write_part(
+        store.write_part(
             folder, index, [RunResult(made_up_row(f"run{index}", latency_s=latency), None)]
         )
     before = results.load_runs(folder)
-    results.collect(folder)
+    store.collect(ResultsFolder(folder))
     pd.testing.assert_frame_equal(results.load_runs(folder), before)
     assert before["latency_s"].tolist() == pytest.approx([np.nan, 2.0, np.nan], nan_ok=True)
 
@@ -250,11 +297,11 @@ def test_what_is_no_number_is_null_and_a_column_of_it_one_of_numbers():
 
 
 def test_a_part_of_several_runs_says_which_runs_are_there(folder):
-    results.write_part(
+    store.write_part(
         folder, 8, [RunResult(made_up_row(f"run{index}"), None) for index in (8, 9, 10)]
     )
     add_part(folder, 2)
-    assert results.finished_runs(folder) == [range(2, 3), range(8, 11)]
+    assert ResultsFolder(folder).finished_runs() == [range(2, 3), range(8, 11)]
 
 
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
@@ -304,12 +351,12 @@ def test_a_file_that_cannot_be_read_while_another_is_made_is_not_said_to_be_writ
 def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
     cv2 = pytest.importorskip("cv2")
     picture = np.full((6, 8, 3), (200, 30, 10), dtype=np.uint8)
-    results.write_part(
+    store.write_part(
         folder,
         0,
         [RunResult(made_up_row("run0"), None, picture), RunResult(made_up_row("run1"), None)],
     )
-    results.write_part(folder, 2, [RunResult(made_up_row("run2"), None, picture)])
+    store.write_part(folder, 2, [RunResult(made_up_row("run2"), None, picture)])
     written = sorted((folder / results.PICTURES).iterdir())
     assert [path.name for path in written] == ["run0.png", "run2.png"]
     colours = cv2.cvtColor(cv2.imread(str(written[0])), cv2.COLOR_BGR2RGB)
@@ -320,7 +367,7 @@ def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
     tables = {
         name: pd.DataFrame([made_up_row(f"{name}{i}", seed=i) for i in range(2)]) for name in "ab"
     }
-    results.write_summary(folder, tables, {"parts": ["a", "b"]})
+    store.write_summary(folder, tables, {"parts": ["a", "b"]})
     runs = results.load_runs(folder)
     assert runs[["run_id", "part"]].values.tolist() == [
         ["a0", "a"],
@@ -329,23 +376,23 @@ def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
         ["b1", "b"],
     ]
     assert list(runs) == [*tables["a"], "part"]
-    assert results.read_manifest(folder)["parts"] == ["a", "b"]
+    assert ResultsFolder(folder).manifest["parts"] == ["a", "b"]
 
 
 def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, monkeypatch):
     monkeypatch.setattr(tables, "ROW_GROUP", 2)
     for index in range(5):
         add_part(folder, index)
-    assert results.has_steps(folder)
-    results.collect(folder)
-    assert results.has_steps(folder)
-    groups = list(results.iterate_runs(folder, ["seed", "no such column"]))
+    assert ResultsFolder(folder).has_steps()
+    store.collect(ResultsFolder(folder))
+    assert ResultsFolder(folder).has_steps()
+    groups = list(ResultsFolder(folder).iterate_runs(["seed", "no such column"]))
     assert [list(group.columns) for group in groups] == [["seed"]] * 3
     assert [group["seed"].tolist() for group in groups] == [[0, 1], [2, 3], [4]]
     changed = results.load_runs(folder).drop(columns="controller")
     write_vouched(folder, {results.RUNS: changed.to_parquet})
     with pytest.raises(ConfigurationError, match="it lacks the column controller"):
-        results.iterate_runs(folder, ["seed"])
+        ResultsFolder(folder).iterate_runs(["seed"])
 
 
 def read_runs(folder):
@@ -372,10 +419,10 @@ def read_steps(folder):
     """Read what figures, paths and curves are drawn of."""
     results.load_steps(folder)
     runs = results.load_runs(folder)
-    for group in load_groups(folder, runs):
-        load_ensembles(folder, runs[runs["mismatch"] == group.mismatch])
-    path_views(folder, runs)
-    error_curves(folder, runs)
+    for group in load_groups(ResultsFolder(folder), runs):
+        load_ensembles(ResultsFolder(folder), runs[runs["mismatch"] == group.mismatch])
+    path_views(ResultsFolder(folder), runs)
+    error_curves(ResultsFolder(folder), runs)
 
 
 @pytest.mark.slow
@@ -430,7 +477,7 @@ def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
     lack = "lacks the columns controller, task, mismatch, seed, status"
     with pytest.raises(ConfigurationError, match=f"runs.parquet is no table of runs: it {lack}$"):
         results.load_runs(folder)
-    assert lack in [finding.fault for finding in examine(folder).findings]
+    assert lack in [finding.fault for finding in examine(ResultsFolder(folder)).findings]
     pd.DataFrame({"run_id": ["a"], "time_s": [0.0]}).to_parquet(folder / results.STEPS)
     with pytest.raises(
         ConfigurationError, match="is no table of steps: it lacks the column error_norm$"
@@ -455,7 +502,7 @@ def unfinished(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # Which take seconds
     monkeypatch.setattr("servobench.harness.apps.report.page.report_pictures", lambda *_: [])
-    results.create_folder(Path("out"), {"run_count": 3})
+    store.create_folder(Path("out"), {"run_count": 3})
     for index in range(2):
         add_part(Path("out"), index)
     return Path("out")
@@ -504,8 +551,8 @@ def test_a_number_whose_square_no_number_can_be_is_refused(tmp_path, value):
 def test_an_empty_table_of_runs_is_named_for_pages_figures_and_notebooks(tmp_path):
     runs = pd.DataFrame({"run_id": []})
     with pytest.raises(ConfigurationError, match="^out holds no finished run$"):
-        results.check_runs(Path("out"), runs)
+        ResultsFolder(Path("out")).check_runs(runs)
     notebook = (Path(__file__).parents[2] / "notebooks" / "analysis.ipynb").read_text(
         encoding="utf-8"
     )
-    assert "results.check_runs(RESULTS, runs)" in notebook
+    assert "folder.check_runs(runs)" in notebook

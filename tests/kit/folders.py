@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from servobench.harness.batch import results
+from servobench.harness.batch import results, store
 from servobench.plant.contract.checksums import write_vouched
 
 CONTROLLERS = ("rbfnn_mfac", "ukf_mfac", "someone_elses")
@@ -55,7 +55,7 @@ def made_up_row(run_id: str, **values: object) -> dict[str, object]:
 
 
 def write_folder(folder: Path, rows: list[dict[str, object]], steps: list[pd.DataFrame]) -> Path:
-    results.create_folder(folder, MANIFEST)
+    store.create_folder(folder, MANIFEST)
     (folder / results.PARTS).rmdir()
     write_vouched(folder, {results.RUNS: pd.DataFrame(rows).to_parquet})
     if steps:

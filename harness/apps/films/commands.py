@@ -134,8 +134,8 @@ def _check_writable(folder: Path) -> None:
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or its only one, or carry out a new one."""
     from servobench.harness.apps.films.replay import logged_run
-    from servobench.harness.batch import results
     from servobench.harness.batch.logs import find_run
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import read_settings
     from servobench.harness.run.episode import run_experiment
@@ -150,8 +150,9 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
             raise ConfigurationError(
                 f"--{name} belongs to a new run; a run of {folder} is named by --run"
             )
-        row = find_run(folder, run_id)
-        return logged_run(row, results.load_steps(folder, [row["run_id"]]))
+        opened = ResultsFolder(folder)
+        row = find_run(opened, run_id)
+        return logged_run(row, opened.steps([row["run_id"]]))
     if run_id is not None:
         raise ConfigurationError("--run names a run of a results folder, and no folder is given")
     names = {

@@ -27,13 +27,14 @@ def report(
     With figures, sortable tables and paths to turn; it needs no network.
     """
     from servobench.harness.apps.report.page import write_report
-    from servobench.harness.batch import results
+    from servobench.harness.batch.results import ResultsFolder
 
-    say(results.describe_missing(folder))
+    opened = ResultsFolder(folder)
+    say(opened.describe_missing())
     began = time.monotonic()
     with console.status("making the report"):
-        path = write_report(folder, out)
-        results.vouch(folder, [path])
+        path = write_report(opened, out)
+        opened.vouch([path])
     seconds = time.monotonic() - began
     took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
     say(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})")

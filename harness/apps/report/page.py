@@ -28,7 +28,7 @@ from servobench.harness.analysis.folder import (
     titled_runs,
 )
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.pictures.figures import KINDS, page_figures
 from servobench.harness.pictures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
 from servobench.harness.pictures.tracks import (
@@ -105,15 +105,15 @@ class Picture(NamedTuple):
     narrow: Drawing  # for a phone
 
 
-def write_report(folder: Path, path: Path | None = None) -> Path:
+def write_report(folder: ResultsFolder, path: Path | None = None) -> Path:
     """Write the report on a results folder, by default `report.html` in it, and return its path.
 
     Raises:
         ConfigurationError: not a results folder, no run in it, or the page cannot be written.
     """
     runs = titled_runs(folder)
-    results.check_runs(folder, runs)
-    target = path or folder / NAME
+    folder.check_runs(runs)
+    target = path or folder.path / NAME
     with accessing(target, "report"):
         write_atomically(
             target, lambda file: file.write_text(_page(folder, runs), encoding="utf-8")
@@ -121,7 +121,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     return target
 
 
-def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
+def report_pictures(folder: ResultsFolder, runs: pd.DataFrame) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
     pictures: list[Picture] = []
     size = 0
@@ -136,7 +136,7 @@ def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
     return pictures
 
 
-def _page(folder: Path, runs: pd.DataFrame) -> str:
+def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
     views = path_views(folder, runs)
     style = _asset("report.css")
     scripts = [_asset("report.js")]
@@ -145,19 +145,19 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
     shown = _shown(runs)
     numbered = tables.runs_table(shown)
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
-    facts = describe_folder(folder, runs)
+    facts = describe_folder(folder.manifest, runs)
     return _template().render(
-        folder=folder.resolve().name,
+        folder=folder.path.resolve().name,
         policy=_policy(style, scripts),
         style=Markup(style),
         scripts=[Markup(script) for script in scripts],
         tables=tables,
         long_table=LONG_TABLE,
-        missing=results.describe_missing(folder),
+        missing=folder.describe_missing(),
         verdict=judge(runs),
         leaders=leaders(runs),
         scope=_scope(runs, facts),
-        aids=describe_controllers(folder),
+        aids=describe_controllers(folder.manifest),
         band=comparison.settling_band(runs),
         following=comparison.settling_band(runs, FOLLOWING_BANDS),
         published=PUBLISHED,
@@ -165,9 +165,9 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         views=views,
         runs=runs,
         numbered=numbered,
-        others=list(results.other_tables(folder)),
+        others=list(folder.other_tables()),
         facts=facts,
-        settings=describe_settings(folder),
+        settings=describe_settings(folder.configuration),
         data=_data(folder, shown, views),
     )
 
@@ -230,7 +230,9 @@ def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     return known.loc[wrong_first[:SHOWN_RUNS]].sort_index()
 
 
-def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
+def _data(
+    folder: ResultsFolder, shown: pd.DataFrame, views: list[dict[str, Any]]
+) -> dict[str, Any]:
     """Return the data of the scripts: runs by their number, with the error over time of those whose steps are kept."""
     curves = error_curves(folder, shown)
     shown = comparison.in_handy_units(shown)
@@ -271,7 +273,7 @@ def _dashes(line: Any) -> list[float]:  # noqa: ANN401 - a line style of matplot
     return [2.0 * length for length in lengths]
 
 
-def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
+def path_views(folder: ResultsFolder, runs: pd.DataFrame) -> list[Json]:
     """Return the paths in space of each plant, mismatch and task; none where no run has one.
 
     Raises:
@@ -286,7 +288,7 @@ def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
     return list(islice(views, MAX_VIEWS))
 
 
-def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
+def error_curves(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Json]:
     """Return the true error of each run over time, by its identifier, as far as its steps are kept.
 
     Of many runs each has few points: each is the largest error of the periods for which it stands. Of more runs than

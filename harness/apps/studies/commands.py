@@ -50,6 +50,7 @@ def robustness(
     """
     from servobench.harness.apps.studies.robustness import BASE, TASK, find_lines, make_map
     from servobench.harness.batch.plan import Batch, parse_seeds
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.cli.progress import watching
     from servobench.plant.robot.catalogue import find_robot
 
@@ -62,7 +63,7 @@ def robustness(
     with watching(console, out, running.execution()) as how:
         files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")
-    judge(out, strict=False)
+    judge(ResultsFolder(out), strict=False)
 
 
 def suite(

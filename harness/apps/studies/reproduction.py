@@ -22,10 +22,11 @@ from servobench.harness.apps.studies.claims import (
     answer_all,
     studies,
 )
-from servobench.harness.batch import results
+from servobench.harness.batch import store
 from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.batch.lock import locked
 from servobench.harness.batch.plan import MAX_SEEDS
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import figure_style, method_styles, save_figure
@@ -87,9 +88,9 @@ def reproduce(
             for plant in plants:
                 answers += answer_all(tables, plant, division)
             main[division] = tables[MAIN]
-            manifest = results.read_manifest(folder / MAIN)
+            manifest = ResultsFolder(folder / MAIN).manifest
         answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
-        results.write_summary(out, main, manifest)
+        store.write_summary(out, main, manifest)
         write_tables(answers, out)
         write = partial(Path.write_text, data=markdown_table(answers), encoding="utf-8")
         write_atomically(out / "answers.md", write)

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis import comparison
 from servobench.harness.apps.loops.loop_analysis import latency_border
-from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures import style
@@ -170,7 +170,7 @@ def make_map(
         limits = predicted_limits(batch.controllers, settings, batch.robot, plant)
     column = pd.Series(limits, name="predicted_latency_limit_s")
     write_atomically(out / LIMITS, partial(column.to_csv, index_label="controller"))
-    return draw_map(map_runs(out), out / FIGURES, limits)
+    return draw_map(map_runs(ResultsFolder(out)), out / FIGURES, limits)
 
 
 def predicted_limits(
@@ -198,14 +198,14 @@ def predicted_limits(
     return limits
 
 
-def map_runs(folder: Path) -> pd.DataFrame:
+def map_runs(folder: ResultsFolder) -> pd.DataFrame:
     """Return the runs of a map; `moved_at_s` says when the camera was moved, NaN where it was not.
 
     Raises:
         ConfigurationError: not the folder of a map.
     """
-    runs = results.load_runs(folder)
-    configuration = results.read_manifest(folder)["configuration"]
+    runs = folder.runs()
+    configuration = folder.configuration
     durations = comparison.column_of(runs, DURATION).fillna(configuration[TASK]["duration"])
     share = configuration["run"]["camera_moves_at"]  # [1] of a run's duration
     is_moved = (runs["axis"] == MOVE) & (runs["magnitude"] > 0.0)

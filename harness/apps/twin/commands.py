@@ -174,13 +174,14 @@ def _logged(
 ) -> tuple[ResolvedRun, DataFrame]:
     """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
+    from servobench.harness.batch.results import ResultsFolder
 
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
     if out is not None and out.exists() and out.samefile(log):
         raise ConfigurationError(f"--out {out} is the log itself; name another file")
     if log.is_dir():
-        resolved, table = logged_in_folder(log, run, controller, named[1])
+        resolved, table = logged_in_folder(ResultsFolder(log), run, controller, named[1])
         for word, given, usual in (("robot", named[0], "ur5"), ("sensing", named[1], "position")):
             if given not in (usual, own := getattr(resolved.request, word)):
                 raise ConfigurationError(

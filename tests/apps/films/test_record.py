@@ -18,9 +18,9 @@ from kit.command import finish, servobench, start, wait_for
 from kit.own import CELL, PLAIN_CELL, write
 from kit.plants import NEEDS_BULLET
 from servobench.harness.apps.films import film
-from servobench.harness.apps.films import film as encoder
 from servobench.harness.apps.films.replay import Replay, Trail, logged_run, stretch
-from servobench.harness.batch import results
+from servobench.harness.batch import store
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
@@ -44,9 +44,9 @@ def run(result):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, result):
     made = tmp_path_factory.mktemp("record") / "out"
-    results.create_folder(made, {"configuration": {"bullet": {"scenery": False}}})
-    results.write_part(made, 0, [result])
-    results.collect(made)
+    store.create_folder(made, {"configuration": {"bullet": {"scenery": False}}})
+    store.write_part(made, 0, [result])
+    store.collect(ResultsFolder(made))
     return made
 
 
@@ -113,7 +113,7 @@ def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
     assert (frames, seconds) == (20, pytest.approx(1.0, abs=0.05))
     with Image.open(paths[1]) as gif:
         assert gif.n_frames == 10
-        assert gif.size[0] == encoder.GIF_WIDTH
+        assert gif.size[0] == film.GIF_WIDTH
     assert paths[1].stat().st_size < 6e6 * 1.0 / 20.0
     shares = [share for share, what in told if what == "frames"]
     assert shares == sorted(shares)
@@ -168,11 +168,11 @@ def test_a_stretch_of_a_run_keeps_its_times_and_rows(run):
 
 def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
-    encoder.find_ffmpeg()  # which starts one the first time
+    film.find_ffmpeg()  # which starts one the first time
     started = []
     popen = subprocess.Popen
     monkeypatch.setattr(
-        encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
+        film.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
     )
 
     def interrupt(share, what):
@@ -187,7 +187,7 @@ def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch
 
 
 def write_frames(path):
-    with encoder.encoding(encoder.find_ffmpeg(), path, (64, 48), 10.0) as write:
+    with film.encoding(film.find_ffmpeg(), path, (64, 48), 10.0) as write:
         for _ in range(100):
             write(np.zeros((48, 64, 3), np.uint8))
 

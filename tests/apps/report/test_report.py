@@ -20,6 +20,7 @@ from kit.folders import (
 )
 from servobench.harness.apps.report import page as report
 from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
 from servobench.plant.contract.checksums import write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -50,7 +51,7 @@ def compared(tmp_path_factory):
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
     folder = sweep(tmp_path_factory.mktemp("swept") / "out")
-    report.write_report(folder)
+    report.write_report(ResultsFolder(folder))
     return folder
 
 
@@ -96,7 +97,7 @@ def test_a_comparison_ends_with_a_report_that_holds_everything_in_itself(compare
 
 
 def test_a_folder_with_failed_runs_only_gives_an_honest_report(tmp_path):
-    page = report.write_report(failed_only(tmp_path / "out")).read_text()
+    page = report.write_report(ResultsFolder(failed_only(tmp_path / "out"))).read_text()
     assert "ended exp1 on kinematic early: crashed." in page
     assert "of which 0 reached the last period" in page
     assert "ValueError: no such thing" in page
@@ -108,7 +109,7 @@ def test_a_folder_of_many_runs_stays_small_and_shows_what_went_wrong_first(tmp_p
     fine = [made_up_row(f"fine-{i}", seed=i, outcome="settled") for i in range(1200)]
     lost = made_up_row("lost", seed=9999, outcome="joint_at_limit")
     steps = [made_up_steps(row["run_id"], periods=30) for row in fine[::400]]
-    path = report.write_report(write_folder(tmp_path / "out", [*fine, lost], steps))
+    path = report.write_report(ResultsFolder(write_folder(tmp_path / "out", [*fine, lost], steps)))
     page = path.read_text()
     assert path.stat().st_size < 1.5e6
     assert page.count('<tr id="run-') == report.SHOWN_RUNS
@@ -119,7 +120,9 @@ def test_a_folder_of_many_runs_stays_small_and_shows_what_went_wrong_first(tmp_p
 def test_the_path_of_the_report_is_told_at_the_end(output_of, monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(
-        report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS)
+        report,
+        "write_report",
+        lambda folder, out: made.append(folder.path) or (folder.path / results.RUNS),
     )
     *_, last = output_of(*RUN, "--report", "--out", tmp_path / "a").strip().splitlines()
     assert last.startswith(f"report: {tmp_path / 'a'}")
@@ -129,7 +132,7 @@ def test_the_path_of_the_report_is_told_at_the_end(output_of, monkeypatch, tmp_p
 
 def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(output_of, monkeypatch, tmp_path):
     def fail(folder, out):
-        raise ConfigurationError(f"report on {folder}: out of luck")
+        raise ConfigurationError(f"report on {folder.path}: out of luck")
 
     monkeypatch.setattr(report, "write_report", fail)
     assert "no report: report on" in output_of(*RUN, "--report", "--out", tmp_path / "out")
@@ -141,7 +144,7 @@ def test_a_folder_with_further_tables_shows_them(tmp_path):
     pd.DataFrame({"claim": ["converges faster"], "answer": ["not reproduced"]}).to_csv(
         folder / "claims.csv"
     )
-    page = report.write_report(folder, tmp_path / "page.html").read_text()
+    page = report.write_report(ResultsFolder(folder), tmp_path / "page.html").read_text()
     assert "not reproduced" in page
     assert not (folder / report.NAME).exists()
 
@@ -157,7 +160,9 @@ def test_a_page_that_cannot_be_written_is_named(monkeypatch, tmp_path):
     with pytest.raises(
         ConfigurationError, match=r"report .*none/page.html cannot be written: No such file"
     ):
-        report.write_report(comparison(tmp_path / "out"), tmp_path / "none" / "page.html")
+        report.write_report(
+            ResultsFolder(comparison(tmp_path / "out")), tmp_path / "none" / "page.html"
+        )
 
 
 @needs_browser

@@ -11,7 +11,8 @@ from kit.browser import browser_page, find_browser
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.controllers.methods import METHODS
 from servobench.harness.apps.report import page as report
-from servobench.harness.batch import results
+from servobench.harness.batch import store
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.pictures.style import NARROW, TEXT, WIDE, method_styles
 
 pytestmark = pytest.mark.skipif(
@@ -98,7 +99,10 @@ FOLDERS["comparison"] = partial(comparison, tasks=("exp1", "circle"))
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
     root = tmp_path_factory.mktemp("pages")
-    return {name: report.write_report(make(root / name)) for name, make in FOLDERS.items()}
+    return {
+        name: report.write_report(ResultsFolder(make(root / name)))
+        for name, make in FOLDERS.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +292,7 @@ def test_an_infinite_time_sorts_behind_all_numbers(browser, tmp_path):
         made_up_row(name, controller=name, settling_time_s=t)
         for name, t in zip("abc", times, strict=True)
     ]
-    show(browser, report.write_report(write_folder(tmp_path / "out", rows, [])))
+    show(browser, report.write_report(ResultsFolder(write_folder(tmp_path / "out", rows, []))))
     heads = "Array.from(document.querySelectorAll('#moves-1 + .sheet .heads button'))"
     browser.evaluate(f"{heads}.find(b => b.textContent.startsWith('settling time')).click()")
     read = "Array.from(document.querySelectorAll('#moves-1 + .sheet tbody tr'), r => r.cells[0].textContent)"
@@ -382,9 +386,9 @@ def test_hostile_texts_stay_texts(browser, tmp_path):
     folder = write_folder(tmp_path / "out", rows, [made_up_steps(row["run_id"]) for row in rows])
     poisoned = {"created": HOSTILE, "python": HOSTILE, "git_commit": HOSTILE, "packages": {"servobench": HOSTILE},
                 "configuration": {HOSTILE: {HOSTILE: HOSTILE}}}  # fmt: skip
-    results.write_manifest(folder, poisoned)
+    store.write_manifest(folder, poisoned)
     pd.DataFrame({HOSTILE: [HOSTILE]}).to_csv(folder / "claims.csv")
-    path = report.write_report(folder)
+    path = report.write_report(ResultsFolder(folder))
     assert "<script>window" not in path.read_text()
     assert "<img src=x" not in path.read_text()
     show(browser, path)

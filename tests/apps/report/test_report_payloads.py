@@ -8,7 +8,8 @@ import pytest
 
 from kit.folders import made_up_row, write_folder
 from servobench.harness.apps.report import page as report
-from servobench.harness.batch import results
+from servobench.harness.batch import store
+from servobench.harness.batch.results import ResultsFolder
 
 PAYLOADS = (
     "<script>pwned=1</script>", "</script><script>pwned=1</script>", "</SCRIPT ><script>pwned=1</script>",
@@ -81,9 +82,9 @@ def page_with(text: str, folder) -> str:
         "own_controllers": {text: {"place": text, "sha256": text}}, "side_by_side": {text: [text]},
         "robots": [{"name": text, "title": text, "source": text, "note": text}],
     }  # fmt: skip
-    results.write_manifest(folder, manifest)
+    store.write_manifest(folder, manifest)
     pd.DataFrame({text: [text]}).to_csv(folder / "claims.csv", index=False)
-    return report.write_report(folder).read_text(encoding="utf-8")
+    return report.write_report(ResultsFolder(folder)).read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ from servobench.harness.apps.studies.robustness import (
     settling_median,
 )
 from servobench.harness.batch.plan import Batch
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.sensing import SENSOR_AXES
@@ -90,7 +91,7 @@ def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long(monkey
     for name, given, periods in (("usual", (), 8), ("given", ("--set", "random.duration=0.2"), 4)):
         out = tmp_path / name
         assert servobench(monkeypatch, "robustness", *words, *given, "--out", str(out)) == 0
-        runs = map_runs(out)
+        runs = map_runs(ResultsFolder(out))
         assert runs["periods"].tolist() == [periods] * 2
         assert runs["moved_at_s"].tolist() == pytest.approx(
             [math.nan, 0.025 * periods], nan_ok=True

@@ -12,8 +12,9 @@ from kit.command import servobench
 from servobench import compare, run
 from servobench.harness.apps.twin.predictions import predictions
 from servobench.harness.apps.twin.shadow import COMMAND, LOGGED, differences, shadow
+from servobench.harness.batch import store
 from servobench.harness.batch.logs import _period, logged_in_file, logged_in_folder
-from servobench.harness.batch.results import read_manifest, write_manifest
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import choose_controller
 from servobench.harness.config.settings import flatten
 from servobench.plant.contract.faults import ConfigurationError
@@ -44,7 +45,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def steps(folder):
-    return logged_in_folder(folder, None, None)[1]
+    return logged_in_folder(ResultsFolder(folder), None, None)[1]
 
 
 def commands(table, prefix=""):
@@ -69,7 +70,7 @@ def show(table, path, controller="constant"):
 
 
 def test_a_run_shown_to_its_own_controller_gives_its_commands_to_the_bit(folder, steps):
-    seen = shadow(*logged_in_folder(folder, None, None))
+    seen = shadow(*logged_in_folder(ResultsFolder(folder), None, None))
     assert len(seen) == 80
     np.testing.assert_array_equal(commands(seen), commands(steps))
     assert (differences(seen)["difference, largest"] == 0.0).all()
@@ -84,7 +85,7 @@ def test_settings_without_a_limit_are_read_from_a_folder(tmp_path):
         settings={"exp2": {"duration": 1.0}},
         out=tmp_path / "runs",
     )
-    resolved, steps = logged_in_folder(tmp_path / "runs", None, None)
+    resolved, steps = logged_in_folder(ResultsFolder(tmp_path / "runs"), None, None)
     assert np.inf in flatten(resolved.controller).values()
     np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
 
@@ -100,13 +101,13 @@ def test_settings_are_read_from_a_folder_that_counts_probing_in_periods(tmp_path
         settings=sections,
         out=tmp_path / "runs",
     )
-    manifest = read_manifest(tmp_path / "runs")
+    manifest = ResultsFolder(tmp_path / "runs").manifest
     told = manifest["configuration"]["ukf_mfac"]
     for word, count in (("probe", 2), ("settle", 7), ("average", 3)):
         assert told.pop(f"initial.{word}_time") == pytest.approx(count * 0.05)
         told[f"initial.{word}_periods"] = count
-    write_manifest(tmp_path / "runs", manifest)
-    resolved, steps = logged_in_folder(tmp_path / "runs", None, None)
+    store.write_manifest(tmp_path / "runs", manifest)
+    resolved, steps = logged_in_folder(ResultsFolder(tmp_path / "runs"), None, None)
     assert (resolved.plant.sensing.outliers, resolved.plant.sensing.latency) == (0.05, 0.095)
     np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
 
@@ -268,7 +269,7 @@ def test_a_row_whose_features_are_nan_has_no_new_frame(steps, tmp_path):
 
 def test_what_is_no_log_is_refused(folder):
     with pytest.raises(ConfigurationError, match="has no run 'other'"):
-        logged_in_folder(folder, "other", None)
+        logged_in_folder(ResultsFolder(folder), "other", None)
 
 
 JOINTS, FEATURES = "joint_position_", ("feature_x", "feature_y", "feature_z", "reference_")
