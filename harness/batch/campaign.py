@@ -7,7 +7,6 @@ when they are needed, so that the memory of this process does not grow with thei
 """
 
 import contextlib
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 
@@ -31,17 +30,17 @@ from servobench.harness.batch.blocks import (
     even_size,
     open_workers,
 )
+from servobench.harness.batch.differences import check_same_batch
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
 from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.lock import check_empty, is_unused, locked
-from servobench.harness.batch.manifest import OWN, describe_batch
+from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.results import ResultsFolder, load_runs
-from servobench.harness.batch.schema import encode
-from servobench.harness.batch.tables import refuse_nameless, writing
+from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
-from servobench.harness.config.settings import Settings, flatten
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest
@@ -56,14 +55,10 @@ from servobench.harness.run.result import RunResult
 from servobench.harness.run.variations import ROLES
 from servobench.plant.contract.dependence import reasons_for_no_effect
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import writing_together
 from servobench.plant.contract.settings import remark
 
 Row = dict[str, Any]
 _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
-# Entries of a manifest that identify its runs
-NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")
-SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
 
 
 @dataclass(frozen=True)
@@ -196,20 +191,11 @@ def _carry_out_at(
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
         # Under the lock: another process may have begun meanwhile
         resumed = how.resume and not is_unused(folder)
-        if how.resume and not resumed:
-            how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
         if resumed:
-            restored = restore_manifest(opened, manifest)
-            check_same_batch(
-                opened, manifest, how.observer.note, remedy="give another folder as `out`"
-            )
-            # Before anything is computed
-            mended = list(mend(opened, manifest))
-            if restored:
-                mended.insert(0, restored)
-            for line in mended:
-                how.observer.note(f"note: {line}")
+            _resume(opened, manifest, how.observer)
         else:
+            if how.resume:
+                how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
             store.create_folder(folder, manifest)
         if not resumed or not opened.is_whole(runs.count):
             for block, outcome in _carry_out_missing(campaign, jobs, own, opened, place, how):
@@ -218,6 +204,17 @@ def _carry_out_at(
                 store.write_part(folder, block.jobs[0].index, outcome, manifest["campaign"])
                 how.observer.finished([result.row for result in outcome])
         store.put_together(opened, manifest)
+
+
+def _resume(folder: ResultsFolder, manifest: dict[str, Any], observer: Observer) -> None:
+    """Refuse a folder of another batch, and mend one of this batch before anything is computed."""
+    restored = restore_manifest(folder, manifest)
+    check_same_batch(folder, manifest, observer.note, remedy="give another folder as `out`")
+    mended = list(mend(folder, manifest))
+    if restored:
+        mended.insert(0, restored)
+    for line in mended:
+        observer.note(f"note: {line}")
 
 
 def check_campaign(
@@ -247,77 +244,6 @@ def check_campaign(
         else:
             build_once(job.run, observer.training)
     return sections
-
-
-def check_same_batch(
-    folder: ResultsFolder, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str
-) -> None:
-    """Refuse a folder of another batch than that of a manifest; `note` gets a line for each difference that may matter.
-
-    Raises:
-        ConfigurationError: other runs or settings, or another version of a file of the user's.
-    """
-    there = folder.manifest
-    if there.get("campaign") != manifest.get("campaign"):
-        other = difference(there, manifest)
-        raise ConfigurationError(
-            f"{folder.path} holds results of other runs or settings: {other}; {remedy}"
-        )
-    if changed := changed_source(there, manifest):
-        raise ConfigurationError(
-            f"{folder.path} was begun with another version of {changed}; {remedy}, or bring the former one back"
-        )
-    for key, things in (
-        ("git_commit", "commit"),
-        ("packages", "packages"),
-        ("engines", "engines"),
-        ("blas", "BLAS"),
-    ):
-        if there.get(key) != manifest.get(key):
-            note(f"note: {folder.path} was begun with other {things}; later runs may differ")
-
-
-def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> int:
-    """Put the finished runs of a batch that was carried out in parts, each in a folder of its own, into one folder.
-
-    Where runs are missing, the same call without a part carries them out in the new folder.
-
-    Args:
-        folders: of the parts, in any order.
-        out: new folder.
-        note: gets a line for each difference between the folders that may matter.
-
-    Returns:
-        Number of runs.
-
-    Raises:
-        ConfigurationError: a folder without parts, of another batch or with a damaged file, or a run that two have.
-    """
-    opened = [ResultsFolder(folder) for folder in folders]
-    manifest = opened[0].manifest
-    found: list[tuple[range, ResultsFolder]] = []
-    tables = []
-    for folder in opened:
-        # Refuses a table of anything else, whose names are of files
-        tables.append(folder.runs())
-        check_same_batch(folder, manifest, note, remedy="leave it away")
-        if not (parts := folder.finished_runs()):
-            raise ConfigurationError(
-                f"{folder.path} holds a whole batch, no part; join tables of several with pandas"
-            )
-        found += [(each, folder) for each in parts]
-    found.sort(key=lambda pair: pair[0].start)
-    for (runs, folder), (others, other) in pairwise(found):
-        if others.start < runs.stop:
-            raise ConfigurationError(
-                f"{folder.path} and {other.path} have the same runs: leave one away"
-            )
-    refuse_nameless(out, pd.concat(tables, ignore_index=True))
-    check_empty(out)
-    with writing(out), writing_together(out) as partial:
-        store.create_folder(partial, manifest)
-        store.copy_parts(((folder, runs.start) for runs, folder in found), partial)
-        return store.put_together(ResultsFolder(partial), manifest)
 
 
 def _jobs(
@@ -412,44 +338,3 @@ def _given(settings: Settings, examples: Iterable[RunRequest]) -> list[tuple[str
     assigned = [(section, key, f"--set {text}") for section, key, text in settings.assigned]
     parts = (key.partition(".") for key in varied)
     return [*assigned, *((role, name, f"varying {role}.{name}") for role, _, name in parts)]
-
-
-def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return in which names or settings two batches differ that are not the same.
-
-    Args:
-        there: manifest of the folder.
-        here: manifest of the new batch.
-    """
-    here = json.loads(encode(here))
-    old = {key: there.get(key) for key in NAMES} | flatten(there.get("configuration", {}))
-    new = {key: here[key] for key in NAMES} | flatten(here["configuration"])
-    for key in dict.fromkeys([*old, *new]):
-        if old.get(key) != new.get(key):
-            return f"{key} {_short(old.get(key, 'unknown'))} there, {_short(new.get(key, 'unknown'))} here"
-    return "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
-
-
-def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return the file of users that differs between two batches; empty if none does.
-
-    Args:
-        there: manifest of the folder; a file that it does not mention counts as unchanged.
-        here: manifest of the new batch, or of another folder.
-    """
-    for name, digest in here.get("files", {}).items():
-        if there.get("files", {}).get(name, digest) != digest:
-            return str(name)
-    for key in SOURCES:
-        for name, record in here.get(key, {}).items():
-            if record.get("sha256") != there.get(key, {}).get(name, record).get("sha256"):
-                return str(record.get("place", name))
-    return ""
-
-
-def _short(value: object) -> str:
-    """Return a value in one line, or the beginning of it."""
-    text = ",".join(map(str, value)) if isinstance(value, list) else str(value)
-    if len(text) <= 60:
-        return text
-    return f"{text[:59]}…"

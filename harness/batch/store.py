@@ -4,7 +4,7 @@ Each file is written atomically, with its checksum before it has its name; `resu
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from servobench.harness.batch.results import (
 )
 from servobench.harness.batch.schema import MANIFEST, encode
 from servobench.harness.batch.tables import writing
-from servobench.harness.run.result import NETWORKS, RunResult, log_entry
+from servobench.harness.run.result import RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
@@ -107,41 +107,6 @@ def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: dict[
     with writing(folder):
         write_vouched(folder, {RUNS: partial(tables.write_table, rows)})
         write_manifest(folder, manifest)
-
-
-def copy_parts(parts: Iterable[tuple[ResultsFolder, int]], other: Path) -> None:
-    """Copy parts, each of a folder and beginning with a run, with pictures of their runs and networks into another one.
-
-    Raises:
-        ConfigurationError: a file of them is damaged.
-        UnwritableFolder: the other folder takes no more files.
-    """
-    files: dict[str, Callable[[Path], object]] = {}
-    for folder, index in parts:
-        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
-        names = [name for name in names if folder.expects(name)]
-        folder.refuse_damaged(names)
-        networks = sorted((folder.path / NETWORKS).glob("*.npz"))
-        names = [
-            *_pictures_of(folder, index),
-            *names,
-            *(f"{NETWORKS}/{path.name}" for path in networks),
-        ]
-        files |= {name: partial(shutil.copyfile, folder.path / name) for name in names}
-    with writing(other):
-        for name in (PICTURES, NETWORKS):
-            if any(file.startswith(name) for file in files):
-                (other / name).mkdir(exist_ok=True)
-        write_vouched(other, files)
-
-
-def _pictures_of(folder: ResultsFolder, index: int) -> list[str]:
-    """Return the names within a folder of the pictures of the runs of a part."""
-    if not (folder.path / PICTURES).is_dir():
-        return []
-    rows = tables.read_tables(folder.path, [part_name(index, RUNS)], columns=("run_id",))
-    names = [f"{PICTURES}/{run}.png" for run in rows["run_id"]]
-    return [name for name in names if (folder.path / name).is_file()]
 
 
 def collect(folder: ResultsFolder) -> int:

@@ -201,10 +201,10 @@ def merge(
 
     The parts of compare or sweep with --part. Where runs are missing, the same call with --resume carries them out.
     """
-    from servobench.harness.batch import campaign
+    from servobench.harness.batch import merging
     from servobench.harness.batch.results import RUNS, ResultsFolder
 
-    count = campaign.merge(folders, out, say)
+    count = merging.merge(folders, out, say)
     say(ResultsFolder(out).describe_missing())
     say(f"{count} runs in {out / RUNS}")
 

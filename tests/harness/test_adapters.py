@@ -9,7 +9,7 @@ import pytest
 import servobench
 from kit.command import servobench as command
 from kit.own import CELL, CONFIGURED_CELL, PLAIN_CELL, WHOLE, write
-from servobench.harness.batch.campaign import changed_source
+from servobench.harness.batch.differences import changed_source
 from servobench.harness.config.registry import choose_controller, choose_plant, find_plant, offered
 from servobench.plant.contract.faults import ConfigurationError
 

@@ -14,6 +14,7 @@ from kit.folders import made_up_row
 from servobench.harness.batch import results, store, tables
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.merging import copy_parts
 from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.results import ResultsFolder
@@ -170,7 +171,7 @@ DAMAGES = {
 def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damaged(begun, tmp_path):
     folder, other = begun, tmp_path / "other"
     store.create_folder(other, {"schema_version": "4"})
-    store.copy_parts([(ResultsFolder(folder), 0), (ResultsFolder(folder), 8)], other)
+    copy_parts([(ResultsFolder(folder), 0), (ResultsFolder(folder), 8)], other)
     assert ResultsFolder(other).part_indices() == [0, 8]
     assert not (other / results.PICTURES).exists()
     runs = pd.read_parquet(folder / results.part_name(0, results.RUNS))["run_id"]
@@ -178,14 +179,14 @@ def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damage
     for name in (runs[0], "another"):
         (folder / results.PICTURES / f"{name}.png").write_text(name)
     for _ in range(2):
-        store.copy_parts([(ResultsFolder(folder), 0)], other)
+        copy_parts([(ResultsFolder(folder), 0)], other)
         assert [path.name for path in (other / results.PICTURES).iterdir()] == [f"{runs[0]}.png"]
     assert {results.part_name(0, results.RUNS), f"{results.PICTURES}/{runs[0]}.png"} <= read_sums(
         other
     ).keys()
     flip(folder / results.part_name(8, results.RUNS))
     with pytest.raises(DamagedFile, match=r"00000008\.runs\.parquet was changed"):
-        store.copy_parts([(ResultsFolder(folder), 8)], other)
+        copy_parts([(ResultsFolder(folder), 8)], other)
 
 
 def test_more_runs_than_were_asked_for_are_of_another_folder():
