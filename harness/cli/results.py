@@ -52,12 +52,8 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.folder import (
-        describe_controllers,
-        latex_tables,
-        methods_paragraph,
-        titled_runs,
-    )
+    from servobench.harness.analysis.folder import describe_controllers, titled_runs
+    from servobench.harness.analysis.latex import latex_tables, methods_paragraph
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch.results import ResultsFolder
 

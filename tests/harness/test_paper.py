@@ -7,13 +7,9 @@ import pandas as pd
 import pytest
 
 from kit.command import carried_out, servobench
-from kit.folders import sweep
-from servobench.harness.analysis.folder import (
-    describe_folder,
-    latex_tables,
-    methods_paragraph,
-    titled_runs,
-)
+from kit.folders import made_up_row, sweep
+from servobench.harness.analysis.folder import describe_folder, titled_runs
+from servobench.harness.analysis.latex import latex_tables, methods_paragraph
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch.api import compare
 from servobench.harness.batch.results import ResultsFolder, load_runs, load_steps
@@ -80,6 +76,19 @@ def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     assert ". Varied: latency [ms] 0, 50. " in methods_paragraph(
         ResultsFolder(folder).manifest, load_runs(folder)
     )
+
+
+def test_the_paragraph_on_methods_ends_its_tools_with_python_where_no_packages_are_listed():
+    runs = pd.DataFrame([made_up_row("a", seed=3)])
+    text = methods_paragraph({"python": "3.11.7", "created": "2026-11-28"}, runs)
+    start = r"All runs were made with servobench unknown~\cite{servobench} "
+    assert rf"\paragraph{{Methods}} {start}(commit unknown, Python 3.11.7). Controllers: " in text
+    assert "the same 1 random robot (seeds 3; 1 runs)" in text
+    assert "All settings are in the file manifest.json of the results." in text
+    assert "year = {2026}" in text
+    versions = {"packages": {"numpy": "2.2.1", "scipy": None}, "engines": {"bullet": "Bullet 3"}}
+    text = methods_paragraph({"python": "3.11.7", **versions}, runs)
+    assert "(commit unknown, Python 3.11.7, numpy 2.2.1, Bullet 3)" in text
 
 
 def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path):

@@ -1,0 +1,169 @@
+"""A results folder for a paper, in LaTeX: tables with booktabs, a paragraph *Methods* and its BibTeX entry."""
+
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import pandas as pd
+
+from servobench.harness.analysis.folder import describe_controllers, describe_folder
+from servobench.harness.analysis.tables import PAIR, Tables
+from servobench.harness.run.variations import varied_columns
+
+SIGNS: Final = str.maketrans(
+    {
+        **{sign: f"\\{sign}" for sign in "_%&#${}"},
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "\u00a0": "~",
+        "∞": r"$\infty$",
+        "–": "--",
+        "−": "$-$",
+        "×": r"$\times$",
+        "µ": r"$\mu$",
+        "²": "$^2$",
+        "³": "$^3$",
+    }
+)
+INTERVAL: Final = re.compile(r" (\[[^\[]*\])$")
+NUMBER: Final = re.compile(r"[-+\d∞–]")
+MINUS: Final = re.compile(r"(?<![\w.])-(?=\d)")
+MAX_LETTERS_OF_ONE_COLUMN: Final = 50  # a table with wider rows spans both columns of a paper
+HEADING: Final = 12  # letters on one line of a heading
+BIBTEX: Final = r"""\begin{filecontents*}[overwrite]{servobench.bib}
+@misc{servobench,
+  author = {{The servobench maintainers}},
+  title = {{servobench: a bench for uncalibrated visual-servoing controllers}},
+  year = {%s},
+  note = {Version %s}
+}
+\end{filecontents*}"""
+
+
+def latex_tables(tables: Tables) -> Iterator[str]:
+    """Yield tables of statistics in LaTeX; the caption of paired differences names their place, too."""
+    place = ""
+    for title, rows in tables:
+        caption = title
+        if rows.columns[0] == PAIR:
+            caption = f"{place}: {title}"
+        else:
+            place = title
+        yield _table(caption, rows)
+
+
+def _table(title: str, rows: pd.DataFrame) -> str:
+    """Return a table of text for the package booktabs, over both columns of a paper if it is wide."""
+    letters = sum(rows[name].str.len().max() for name in rows)
+    kind = "table" if letters <= MAX_LETTERS_OF_ONE_COLUMN else "table*"
+    sides = "".join("r" if rows[name].str.match(NUMBER).all() else "l" for name in rows)
+    headings = " & ".join(map(_heading, rows.columns, sides))
+    body = [rf"{' & '.join(row)} \\" for row in rows.map(_cell).itertuples(index=False)]
+    lines = [
+        rf"\begin{{{kind}}}\centering\footnotesize\setlength{{\tabcolsep}}{{4pt}}",
+        rf"\caption{{{title.translate(SIGNS)}}}",
+        rf"\begin{{tabular}}{{@{{}}{sides}@{{}}}}\toprule",
+        rf"{headings} \\\midrule",
+        *body,
+        rf"\bottomrule\end{{tabular}}\end{{{kind}}}",
+    ]
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    """Return a cell with a true minus and its interval in small print."""
+    escaped = MINUS.sub("$-$", text.translate(SIGNS))
+    return INTERVAL.sub(r" {\\scriptsize \1}", escaped)
+
+
+def _heading(name: str, side: str) -> str:
+    """Return a heading over several lines, its unit on the last one."""
+    words, _, unit = name.partition(" [")
+    lines = textwrap.wrap(words.replace(" %", "\u00a0%"), HEADING)
+    if unit:
+        lines.append(f"[{unit}")
+    text = r"\\{}".join(line.translate(SIGNS) for line in lines)
+    return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}"
+
+
+def methods_paragraph(manifest: Mapping[str, Any], runs: pd.DataFrame) -> str:
+    """Return a paragraph that says how the runs of a folder were made, from its manifest, and its BibTeX entry."""
+    facts = describe_folder(manifest, runs)
+    packages = manifest.get("packages") or {}
+    version = str(packages.get("servobench") or "unknown").translate(SIGNS)
+    commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
+    python = manifest.get("python", "unknown")
+    tools = ", ".join([f"Python {python}", *_used_libraries(manifest)]).translate(SIGNS)
+    # The first sentence is LaTeX already, with a citation; the others are plain text.
+    first = f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, {tools})"
+    sentences = [
+        _combinations(manifest, facts),
+        *_aids(manifest),
+        *_varied(facts, runs),
+        _robots(facts, runs),
+        "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
+        "Differences are paired by robot, with Student's intervals (90 %) of their means; verdicts are those of a sign "
+        "test on lost runs, which ended early or have no value, and of two one-sided t-tests (5 %) against the margin",
+        _settings(manifest.get("changed")),
+    ]
+    text = ". ".join([first, *(each.translate(SIGNS) for each in sentences)])
+    year = str(manifest.get("created", ""))[:4].translate(SIGNS)
+    entry = BIBTEX % (year, f"{version}, commit {commit}")
+    return rf"\paragraph{{Methods}} {text}." + f"\n\n{entry}"
+
+
+def _used_libraries(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the numerical libraries and the engines with their versions, as far as known."""
+    packages = manifest.get("packages") or {}
+    libraries = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
+    engines = manifest.get("engines") or {}
+    return [*libraries, *map(str, engines.values())]
+
+
+def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
+    """Return a sentence on controllers, tasks, plant, sensing and mismatch."""
+    titles = [str(each.get("title")) for each in manifest.get("robots", [])]
+    robots = ", ".join(titles) or "unknown robot"
+    return (
+        f"Controllers: {facts['controller']}; tasks: {facts['task']}; plant: {facts['plant']} ({robots}); "
+        f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {facts['mismatch']}"
+    )
+
+
+def _aids(manifest: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on the aids of several controllers; none for a single one."""
+    aids = describe_controllers(manifest)
+    if not aids:
+        return []
+    return [f"Aids (stages around the law, which any controller can have): {aids}"]
+
+
+def _robots(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
+    """Return a sentence on the robots that the seeds draw."""
+    count = runs["seed"].nunique()
+    robots = f"{count} random robots" if count > 1 else f"{count} random robot"
+    seeds, _, _ = facts["seeds"].partition(" (")
+    return f"Every controller met the same {robots} (seeds {seeds}; {len(runs)} runs)"
+
+
+def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> list[str]:
+    """Return a sentence with the values of each setting that the runs vary; none if they vary none."""
+    varied = []
+    for name, (heading, _) in varied_columns(runs.columns).items():
+        if runs[name].nunique(dropna=False) > 1:
+            varied.append(f"{heading} {facts[heading]}")
+    if not varied:
+        return []
+    return [f"Varied: {'; '.join(varied)}"]
+
+
+def _settings(changed: Mapping[str, Any] | None) -> str:
+    """Return a sentence on settings that were changed; None if the manifest does not say which."""
+    if changed is None:
+        return "All settings are in the file manifest.json of the results"
+    if not changed:
+        return "All settings are the defaults of this version"
+    pairs = ", ".join(f"{key} = {value}" for key, value in changed.items())
+    return f"Settings other than the defaults: {pairs}"
