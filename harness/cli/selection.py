@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from servobench.harness.cli.terminal import say
 from servobench.plant.contract.faults import ConfigurationError
@@ -21,15 +21,11 @@ class Names(NamedTuple):
     """The names of a kind."""
 
     known: Callable[[], Sequence[str]]  # returns all of them
-    find: Callable[
-        [str], Any
-    ]  # refuses a wrong word; a text that it returns is the name that the word stands for
-    tried: Word | None = (
-        None  # plants or controllers, of which those of third parties are tried if `all` is meant
-    )
-    begun: Callable[[str], Iterable[str]] | None = (
-        None  # returns the offers for a word, where names have parts
-    )
+    choose: Callable[[str], str]  # returns the name for which a word stands; refuses a wrong word
+    # Plants or controllers, of which those of third parties are tried if `all` is meant
+    tried: Word | None = None
+    # Returns the offers for a word, where names have parts
+    begun: Callable[[str], Iterable[str]] | None = None
 
 
 Kind: TypeAlias = str | Callable[[], Names]  # a word of `names_of`, or names of an application
@@ -45,14 +41,19 @@ def names_of(kind: Kind) -> Names:
         return kind()
     match kind:
         case "plants":
+            from servobench.harness.batch import trials
             from servobench.harness.config.registry import plant_names
 
-            return Names(plant_names, partial(_choose, "plant"), "plant")
+            return Names(plant_names, partial(trials.choose, "plant"), "plant")
         case "controllers":
+            from servobench.harness.batch import trials
             from servobench.harness.config.registry import controller_names
 
             return Names(
-                controller_names, partial(_choose, "controller"), "controller", _begun_controllers
+                controller_names,
+                partial(trials.choose, "controller"),
+                "controller",
+                _begun_controllers,
             )
         case "estimators":
             from servobench.controllers.methods import ESTIMATORS
@@ -65,15 +66,15 @@ def names_of(kind: Kind) -> Names:
         case "mismatch":
             from servobench.plant.robot.mismatch import PROFILES, Mismatch
 
-            return Names(lambda: list(PROFILES), Mismatch.parse, begun=_begun_mismatches)
+            return Names(lambda: list(PROFILES), accepted(Mismatch.parse), begun=_begun_mismatches)
         case "robot":
             from servobench.plant.robot.catalogue import ROBOTS
 
-            return Names(lambda: list(ROBOTS), _find_robot)
+            return Names(lambda: list(ROBOTS), _choose_robot)
         case "sensing":
             from servobench.harness.config.sensing import find_sensing, sensing_names
 
-            return Names(sensing_names, find_sensing)
+            return Names(sensing_names, accepted(find_sensing))
     raise ValueError(f"kind must be plants, controllers or another kind of names, got {kind!r}")
 
 
@@ -95,17 +96,21 @@ def _begun_mismatches(word: str) -> Iterable[str]:
     return axes if plus else [*PROFILES, *axes]
 
 
-def _find_robot(word: str) -> str:
+def _choose_robot(word: str) -> str:
     from servobench.plant.robot.catalogue import find_robot
 
     say(find_robot(word).note)
     return word
 
 
-def _choose(word: Word, given: str) -> str:
-    from servobench.harness.batch.trials import choose
+def accepted(find: Callable[[str], object]) -> Callable[[str], str]:
+    """Return a function that returns a word as the name if `find`, which refuses a wrong one, accepts it."""
 
-    return choose(word, given)
+    def choose_word(word: str) -> str:
+        find(word)
+        return word
+
+    return choose_word
 
 
 def completing(kind: Kind) -> Callable[[str], list[str]]:
@@ -143,7 +148,7 @@ def choose(kind: Kind, word: str) -> str:
         raise ConfigurationError(
             f"{word!r} names several, where one is wanted; compare takes several"
         )
-    name = _chosen(names.find, word)
+    name = names.choose(word)
     _tell_unused(names, [name])
     return name
 
@@ -157,22 +162,27 @@ def split(kind: Kind, text: str, *, option: str = "", robot: str = "ur5") -> tup
         option: by which it was given, if not by one called as the kind.
         robot: for which plants and controllers of third parties are tried.
     """
-    from servobench.harness.batch.trials import try_all
-
     names = names_of(kind)
-
-    def usable() -> Iterable[str]:
-        if names.tried is None:
-            return names.known()
-        found = try_all(names.tried, robot)
-        for each in found:
-            if each.fault:
-                sys.stderr.write(f"servobench: left out: {each.fault}\n")
-        return [each.name for each in found if not each.fault]
-
-    chosen = split_names(option or str(kind), text, names.known(), names.find, usable)
-    _tell_unused(names, split_words(text, names.known()))
+    known = names.known()
+    usable = partial(_usable, names, robot)
+    chosen = split_names(option or str(kind), text, known, names.choose, usable)
+    _tell_unused(names, split_words(text, known))
     return chosen
+
+
+def _usable(names: Names, robot: str) -> Sequence[str]:
+    """Return the names that can be used for a robot, and print why others cannot."""
+    if names.tried is None:
+        return names.known()
+    from servobench.harness.batch import trials
+
+    usable = []
+    for each in trials.try_all(names.tried, robot):
+        if each.fault:
+            sys.stderr.write(f"servobench: left out: {each.fault}\n")
+        else:
+            usable.append(each.name)
+    return usable
 
 
 def _tell_unused(names: Names, named: Sequence[str]) -> None:
@@ -188,7 +198,7 @@ def split_names(
     option: str,
     text: str,
     known: Sequence[str],
-    find: Callable[[str], Any] | None = None,
+    choose_one: Callable[[str], str] | None = None,
     usable: Callable[[], Iterable[str]] | None = None,
 ) -> tuple[str, ...]:
     """Split a comma-separated list of names, and refuse an empty one and a name that stands in it twice.
@@ -197,7 +207,7 @@ def split_names(
         option: by which it was given, without dashes.
         text: the list.
         known: all names.
-        find: see `Names`; None if all words are known, and another one is refused with a suggestion.
+        choose_one: see `Names.choose`; None if only known words are names: another one gets a suggestion.
         usable: returns the names that `all` stands for; None for those that are known.
     """
     from servobench.plant.contract.settings import suggest
@@ -206,8 +216,10 @@ def split_names(
     for word in split_words(text, known):
         if word == ALL:
             names += known if usable is None else usable()
-        elif find is not None or word in known:
-            names.append(word if find is None else _chosen(find, word))
+        elif choose_one is not None:
+            names.append(choose_one(word))
+        elif word in known:
+            names.append(word)
         else:
             raise ConfigurationError(f"--{option}: unknown {word!r}: {suggest(word, known)}")
     if not names:
@@ -216,10 +228,3 @@ def split_names(
         if names.count(name) > 1:
             raise ConfigurationError(f"--{option} names {name} twice")
     return tuple(names)
-
-
-def _chosen(find: Callable[[str], Any], word: str) -> str:
-    found = find(word)
-    if isinstance(found, str):
-        return found
-    return word

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import PLANT, Value, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.selection import Names
+from servobench.harness.cli.selection import Names, accepted
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say
 from servobench.plant.contract.files import split_words
 
@@ -21,7 +21,7 @@ DEFAULT_CONTROLLERS = (
 def _challenges() -> Names:
     from servobench.harness.apps.studies.challenge import challenge_names, find_challenge
 
-    return Names(challenge_names, find_challenge)
+    return Names(challenge_names, accepted(find_challenge))
 
 
 CHALLENGE = Value("NAME", selection.completing(_challenges))

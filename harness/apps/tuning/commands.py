@@ -70,7 +70,9 @@ def tune(
     from servobench.harness.batch.blocks import open_workers
     from servobench.harness.batch.lock import locked
 
-    names = selection.split_names("controllers", controllers, tuple(SPACES), find_tunable)
+    names = selection.split_names(
+        "controllers", controllers, tuple(SPACES), selection.accepted(find_tunable)
+    )
     with configuration_errors():
         runs = TuningSet(selection.split("plants", plants), robots, offset)
         second = runs.second()
