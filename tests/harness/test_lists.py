@@ -10,10 +10,12 @@ import pytest
 from kit.command import servobench
 from servobench.harness.batch.results import load_runs
 from servobench.harness.cli.main import command_line, join_words
+from servobench.harness.cli.selection import accepted, split_names
 from servobench.harness.config.description import plain
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import flatten
 from servobench.harness.run.tasks import TASKS
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.kinematic import ENTRY
 
 
@@ -124,6 +126,20 @@ def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_we
     words, joined, before
 ):
     assert join_words([*words, "after"], len(words) - 1) == (joined, before)
+
+
+def test_a_word_of_a_list_is_a_name_if_it_is_known_chosen_or_accepted():
+    assert split_names("kind", "b, a", ("a", "b")) == ("b", "a")
+    assert split_names("kind", "x,all", ("a", "b"), str.upper, lambda: ["B"]) == ("X", "B")
+    assert split_names("kind", "3", (), accepted(int)) == ("3",)
+    with pytest.raises(ValueError, match="invalid literal"):
+        split_names("kind", "three", (), accepted(int))
+    with pytest.raises(ConfigurationError, match="^--kind names a twice$"):
+        split_names("kind", "a,all", ("a", "b"))
+    with pytest.raises(ConfigurationError, match="^--kind: unknown 'c': "):
+        split_names("kind", "c", ("a", "b"))
+    with pytest.raises(ConfigurationError, match="^--kind is empty; valid: a, b$"):
+        split_names("kind", "", ("a", "b"))
 
 
 def test_a_run_takes_its_controller_first(no_figures, monkeypatch, tmp_path):
