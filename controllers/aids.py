@@ -51,39 +51,39 @@ class AidsConfig:
     """The aids of a composed controller; by default there are none."""
 
     delay: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
-    """Compensate the camera's latency: pair motions of the feature with joint motions, and predict the feature."""
+    """Compensate the camera's latency: pair feature and joint motions, predict the feature."""
     response: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
-    """Smith predictor: the law acts on the state that the arm reaches once all commands sent are carried out."""
+    """Smith predictor: the law acts on the state after all commands sent."""
     noise: Annotated[
         Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))
     ] = "given"
-    """The standard deviation of the feature, as `feature_noise` or identified."""
+    """The feature's standard deviation: `feature_noise`, or identified."""
     filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
-    """Filter of the feature: the noise that the regression finds in the last frame is taken from it."""
+    """Subtract the noise that the regression finds in the last frame."""
     model: Annotated[
         Literal["own", "nominal", "regression"],
         Switch("regression", tuned=("own", "nominal", "regression")),
     ] = "own"
-    """The estimator's own Jacobian, its deviation from the nominal one, or from a regression on the nominal one."""
+    """What the estimator learns: the Jacobian, or its deviation from the nominal one or from a regression on it."""
     feedforward: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
-    """Feedforward of the reference's own motion; needs a preview."""
+    """Feedforward of the reference's motion; needs a preview."""
     posture: Annotated[bool, Switch(equipped=True)] = False
-    """Null-space centring: move towards the middle of the working region in the null space of the Jacobian."""
+    """Null-space centring: move towards the middle of the working region."""
     limit: Annotated[
         Literal["scale", "clip", "redistribute"],
         Switch("redistribute", tuned=("scale", "clip", "redistribute")),
     ] = "scale"
-    """Saturation: a command beyond the limits is scaled, clipped by joint, or redistributed to joints with room."""
+    """Saturation of a command: scaled, clipped by joint, or redistributed."""
     longest_delay: Annotated[NonNegative, Le(1.0), Only(delay="identified")] = 0.25
-    """[s] the longest delay that is considered."""
+    """[s] longest delay considered, if identified."""
     latency: Annotated[Delay, Only(delay="given")] = 0.0
-    """[s] latency of the camera; a method that gets the truth gets the true one."""
+    """[s] of the camera, if the delay is given; methods that get the truth get the true one."""
     command_delay: Annotated[Delay, Only(response="given")] = 0.05
-    """[s] until a command shows in the joints."""
+    """[s] from command to joint motion, if the response is given."""
     lag: Annotated[Delay, Only(response="given")] = 0.05
-    """[s] time constant of the joints."""
+    """[s] time constant of the joints, if the response is given."""
     response_length: Annotated[Positive, Le(2.0), Only(response="identified")] = 0.6
-    """[s] within which joints respond to a command."""
+    """[s] length of the joints' response, if identified."""
     feature_noise: Annotated[
         Deviation,
         Only(
@@ -94,15 +94,15 @@ class AidsConfig:
             model=("nominal", "regression"),
         ),
     ] = 0.001
-    """[m] standard deviation of a feature, of pixels too; the first guess where it is identified."""
+    """[m] standard deviation, of pixels too; the first guess if identified."""
     delay_margin: Annotated[NonNegative, Only(delay="identified")] = 6.0
-    """[1] by which a delay must be better than the present one, in −2 log likelihood."""
+    """[1] lead in −2 log likelihood at which a new delay is adopted."""
     score_memory: Annotated[Share, Only(delay="identified")] = 1.0
-    """[1] share of a delay's score that is kept from one motion to the next; below 1 for a latency that changes."""
+    """[1] share of a delay's score kept from motion to motion; below 1 for a changing latency."""
     posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0, log=True), Only(posture=True)] = 0.6
-    """[1/s] gain of the null-space centring."""
+    """[1/s] of `posture`."""
     damping: Annotated[Positive, Only(feedforward=True, posture=True, limit="redistribute")] = 0.02
-    """[m/rad] damping of the aids' pseudo-inverse."""
+    """[m/rad] of the pseudo-inverse in feedforward, `posture` and redistribution."""
 
     @property
     def needs_past(self) -> bool:

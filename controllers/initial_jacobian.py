@@ -36,15 +36,15 @@ class InitialConfig:
     """Settings of the initial Jacobian; by default a probe rests for longer than lag, delay and latency last."""
 
     source: Literal["nominal", "probe", "given"] = "nominal"
-    """Where Ĵ₀ comes from: the nominal model, probing moves, or `given`."""
+    """Source of Ĵ₀: nominal model, probing moves, or `given`."""
     probe_step: Annotated[Positive, Usual(0.3), Only(source="probe")] = 0.03
-    """[rad] size of a probing move: some 20 mm at the ball, far above 1 mm of noise."""
+    """[rad] size of a probing move; some 20 mm at the ball."""
     probe_time: Annotated[Positive, Usual(1.0), Only(source="probe")] = 0.1
-    """[s] over which a probing move is spread."""
+    """[s] duration of a probing move."""
     settle_time: Annotated[Delay, Only(source="probe")] = 0.35
-    """[s] of rest before a feature counts."""
+    """[s] rest before a feature counts."""
     average_time: Annotated[Positive, Usual(2.0), Only(source="probe")] = 0.15
-    """[s] of valid features that are averaged at each rest."""
+    """[s] averaging of valid features at each rest."""
     given: Annotated[tuple[tuple[Number, ...], ...], Only(source="given")] = ()
     """[m/rad] m rows of n entries."""
 

@@ -38,29 +38,29 @@ class NmpcCalibratedConfig:
     """Settings of `nmpc_calibrated`; "tuned" = on simulated UR5s with joint lag and a command delay of one period."""
 
     horizon_time: Positive = 0.4
-    """[s] how far the prediction reaches; with the delay within the default preview of 0.5 s."""
+    """[s] prediction horizon; with the delay within the default preview of 0.5 s."""
     moves: Count = 8
-    """[1] H, equal blocks of constant joint velocity in the horizon; fewer where they were shorter than a period."""
+    """[1] H, equal blocks of constant joint velocity, none shorter than a period."""
     delay: NonNegative = 0.1
-    """[s] until a command moves the joints: half of it transport, half of it lag; bridged."""
+    """[s] from command to joint motion, half transport, half lag; bridged."""
     decay: Positive = 20.0
-    """[1/s] the error should decay as exp(−decay t); tuned."""
+    """[1/s] desired decay exp(−decay t) of the error; tuned."""
     move_weight: Positive = 0.001
-    """[m²/rad²] q of Q = q I, for the joint step of 0.05 s; small, it only settles the free joints."""
+    """[m²/rad²] q of Q = q I, for a joint step of 0.05 s; only settles the free joints."""
     terminal_weight: NonNegative = 0.0
-    """[1] extra weight of the error at the end, against that of 0.05 s."""
+    """[1] extra weight of the final error, against that of 0.05 s."""
     iterations: Count = 2
     """[1] Gauss-Newton steps per period at most; 1 is the real-time iteration."""
     image: bool = False
-    """Feed the image back (offset-free control); without it the controller trusts encoders and model alone."""
+    """Offset-free control; false: encoders and model alone."""
     image_window: Annotated[Positive, Only(image=True)] = 0.5
-    """[s] of frames over which the offset of the image from the model is estimated."""
+    """[s] of frames for the image's offset from the model."""
     joint_acceleration_limit: PositiveOrInfinite = math.inf
-    """[rad/s²] limit of the change between two commands; inf: none."""
+    """[rad/s²] limit between two commands; inf: none."""
     limit_position: bool = True
-    """Keep the predicted joint positions within the plant's limits."""
+    """Keep predicted joint positions within the plant's limits."""
     solver: Solver = "daqp"
-    """Solver of the quadratic programs; "qpoases" for a cross-check."""
+    """QP solver; "qpoases" for a cross-check."""
     fallback: Literal["hold", "raise"] = "hold"
     """Without a solution: zero velocity, or `SolverFailed`."""
 

@@ -23,8 +23,8 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- end -->
 
 The meaning of a setting is the string below its field, the default that of the class, with the other choices behind it.
-Several classes share a table, in which a row that is alike in some of them stands once.
-A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
+Several classes share a table, in which a setting with one meaning stands once. Dimensionless settings show no unit.
+A section of settings that has a table of its own on some page is explained there only: other tables list the defaults
 in which they differ. A measured table is one of docs/tables, or some of its rows by their first cell, or some of its
 columns by number. `make results` writes it; until it exists the part stays as it is.
 `stored` links to measured tables of a study instead. `attributes`
@@ -268,21 +268,32 @@ def labelled(places: str) -> dict[str, type[Any]]:
 
 
 def settings_table(kinds: dict[str, type[Any]]) -> str:
-    """Return the table of the settings of classes by label; those of a nested section have its name before theirs."""
-    owners: dict[tuple[str, ...], list[str]] = {}
+    """Return the table of the settings of classes by label; a setting that not all of them have names its classes."""
+    owners: dict[tuple[str, str], dict[str, list[str]]] = {}
     for label, kind in kinds.items():
-        for row in settings_rows(kind):
-            owners.setdefault(row, []).append(f"`{label}`")
-    if len(kinds) == 1:
-        return table(SETTING, list(owners))
-    names = {
-        row: "all" if len(found) == len(kinds) else ", ".join(found)
-        for row, found in owners.items()
-    }
-    shared_first = sorted(owners, key=lambda row: -len(owners[row]))
-    return table(
-        (SETTING[0], "of", *SETTING[1:]), [(row[0], names[row], *row[1:]) for row in shared_first]
-    )
+        for setting, default, meaning in settings_rows(kind):
+            defaults = owners.setdefault((setting, meaning), {})
+            defaults.setdefault(default, []).append(label)
+    rows = []
+    for (setting, meaning), defaults in owners.items():
+        found = [label for labels in defaults.values() for label in labels]
+        usual, *others = defaults
+        cells = [usual, *(f"`{'`, `'.join(defaults[each])}`: {each}" for each in others)]
+        rows.append((with_owners(setting, found, list(kinds)), "; ".join(cells), meaning, found))
+    shared_first = sorted(rows, key=lambda row: -len(row[3]))
+    return table(SETTING, [row[:3] for row in shared_first])
+
+
+def with_owners(setting: str, owners: list[str], labels: list[str]) -> str:
+    """Return a setting with the labels that have it, as `label.key`, `key` of several, or `key` where all have it."""
+    if len(owners) == len(labels):
+        return setting
+    if len(owners) == 1:
+        return setting.replace("`", f"`{owners[0]}.", 1)
+    if 2 * len(owners) <= len(labels):
+        return f"{setting} of " + ", ".join(f"`{label}`" for label in owners)
+    others = [f"`{label}`" for label in labels if label not in owners]
+    return f"{setting} of all but {', '.join(others)}"
 
 
 def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
@@ -301,11 +312,12 @@ def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
             raise ValueError(
                 f"{kind.__name__}.{each.key} has no string below it that says its meaning"
             )
-        unit = f" [{each.unit}]" if each.unit else ""
+        unit = f" [{each.unit}]" if each.unit not in ("", "1") else ""
         value = toml(each.value)
         choices = each.allowed.split(", ") if value in each.allowed.split(", ") else []
         others = ", ".join(choice for choice in choices if choice != value)
-        yield (f"`{each.key}`{unit}", f"{value}, or {others}" if others else value, each.meaning)
+        meaning = "see below" if key and type(own) in classes_with_tables() else each.meaning
+        yield (f"`{each.key}`{unit}", f"{value}, or {others}" if others else value, meaning)
 
 
 @functools.cache

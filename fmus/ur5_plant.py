@@ -26,9 +26,9 @@ class Ur5FmuConfig(ArmConfig):
     fmi_version: FmiVersion = 2
     """Version of FMI."""
     joint_lags: tuple[Delay, ...] = ()
-    """[s] τ of each of the joints in place of `lag`; an empty list for none."""
+    """[s] τ of each joint in place of `lag`; empty: none."""
     encoder_resolution: NonNegative = 0.0
-    """[rad] step of reported positions; 0 means exact ones, as those of `kinematic`."""
+    """[rad] step of reported positions; 0: exact."""
 
 
 @cache

@@ -42,13 +42,13 @@ class ArmConfig:
     """Settings of this plant and of the exported arm; defaults are those of an arm under a stereo camera."""
 
     max_joint_speed: JointSpeed = 1.0
-    """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
+    """[rad/s] limit of every joint, besides its maker's (UR5: π)."""
     joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
-    """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
+    """[rad] largest joint position each way, besides its maker's limits."""
     lag: Delay = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     command_delay: Delay = 0.05
-    """[s] between a command and its first effect; rounded by 0.5 ms at most where the control period needs it."""
+    """[s] from command to first effect; rounded by at most 0.5 ms to fit the period."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
     mechanics: MechanicsConfig = nested(MechanicsConfig)
@@ -60,7 +60,7 @@ class KinematicConfig(ArmConfig):
     """Settings of the kinematic plant."""
 
     overshoot: ShareBelowOne = 0.0
-    """[1] of a step of the velocity: above 0 velocity loops swing at 1/τ, as stiff ones under unexpected loads do."""
+    """[1] of a velocity step; above 0 the velocity loops oscillate at 1/τ."""
 
     def __post_init__(self) -> None:
         """Check across fields."""

@@ -79,11 +79,11 @@ class MckfConfig(RandomWalk):
     """Settings of the maximum correntropy Kalman filter (`mckf_estimator`)."""
 
     bandwidth: Positive = 3.0
-    """[1] b, error in standard deviations at which the weight has sunk to exp(−1/2)."""
+    """[1] b, error in standard deviations with the weight exp(−1/2)."""
     tolerance: Positive = 1e-6
-    """[1] the iteration ends when J changes by less than this share of its norm."""
+    """[1] relative change of J that ends the iteration."""
     iterations: Count = 20
-    """[1] the most of them in an update."""
+    """[1] limit per update."""
 
 
 @settings
@@ -91,13 +91,13 @@ class GmckfConfig(RandomWalk):
     """Settings of the generalised maximum correntropy Kalman filter."""
 
     shape: Positive = 1.5
-    """[1] α, exponent of the kernel: 2 is Gaussian, 1 is Laplacian."""
+    """[1] α, exponent of the kernel: 2 Gaussian, 1 Laplacian."""
     bandwidth: Positive = 4.0
-    """[1] β, error in standard deviations at which the kernel has sunk to exp(−1)."""
+    """[1] β, error in standard deviations with the kernel exp(−1)."""
     tolerance: Positive = 1e-6
-    """[1] the iteration ends when J changes by less than this share of its norm."""
+    """[1] relative change of J that ends the iteration."""
     iterations: Count = 20
-    """[1] the most of them in an update."""
+    """[1] limit per update."""
 
 
 class Iterate(NamedTuple):
@@ -235,7 +235,7 @@ class ImcckfConfig(RandomWalk):
     """Settings of the improved maximum correntropy criterion Kalman filter."""
 
     bandwidth: Positive = 5.0
-    """[1] b, norm of the innovation in standard deviations at which the weight has sunk to exp(−1/2)."""
+    """[1] b, norm of the innovation in standard deviations with the weight exp(−1/2)."""
 
 
 def imcckf_update(
@@ -278,9 +278,9 @@ class RmckfConfig(RandomWalk):
     """Settings of the regularised maximum correntropy criterion Kalman filter."""
 
     bandwidth: Positive = 3.0
-    """[1] b, innovation in standard deviations at which the weight has sunk to exp(−1/2)."""
+    """[1] b, innovation in standard deviations with the weight exp(−1/2)."""
     regularisation: Positive = 1e-6
-    """[1] ε, added to every weight; the authors'."""
+    """[1] ε, added to every weight; the authors' value."""
 
 
 def rmckf_update(

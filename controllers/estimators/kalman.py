@@ -55,13 +55,13 @@ class RandomWalk:
     """Settings of every filter in which the Jacobian is a random walk."""
 
     initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀; tuned for the Kalman filter: with a larger one latency spoils the first motions."""
+    """[m/rad] of an entry of Ĵ₀; tuned for `kalman`; larger, latency spoils the first motions."""
     walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; tuned for the Kalman filter."""
+    """[m/rad/√s] deviation of an entry after 1 s of motion; tuned for `kalman`."""
     feature_noise: Deviation = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified."""
+    """[m] σ of the feature per axis, unless identified."""
     min_joint_step: NonNegative = 0.002
-    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
+    """[rad] smaller motions are skipped as noise."""
 
 
 @settings
@@ -69,7 +69,7 @@ class KalmanConfig(RandomWalk):
     """Settings of the Kalman filter."""
 
     form: Literal["split", "full"] = "split"
-    """Two computations of the same numbers; "full" is the readable reference."""
+    """Same numbers; "full" is the readable reference."""
 
 
 def cholesky_of(P: FloatArray) -> FloatArray:
@@ -234,13 +234,13 @@ class UkfConfig(RandomWalk):
     """Settings of the unscented Kalman filter."""
 
     alpha: Annotated[Positive, Only(form="sigma_points")] = 1.0
-    """[1] spread of the sigma points; 1 keeps all weights from being negative."""
+    """[1] spread of the sigma points; 1: no negative weights."""
     beta: Annotated[NonNegative, Only(form="sigma_points")] = 2.0
-    """[1] prior knowledge of the distribution; 2 suits a Gaussian."""
+    """[1] prior of the distribution; 2 suits a Gaussian."""
     kappa: Annotated[NonNegative, Only(form="sigma_points")] = 0.0
     """[1] secondary spread."""
     form: Literal["split", "sigma_points"] = "split"
-    """Two computations of the same numbers; "sigma_points" is the reference, several times slower."""
+    """Same numbers; "sigma_points" is the reference, several times slower."""
 
 
 class SigmaWeights(NamedTuple):
@@ -325,13 +325,13 @@ class RlsConfig:
     """Settings of recursive least squares."""
 
     memory: PositiveOrInfinite = 0.975
-    """[s] of motion that is remembered: λ = exp(−duration/memory), 0.95 for a motion of 0.05 s."""
+    """[s] λ = exp(−duration/memory), 0.95 for a motion of 0.05 s."""
     initial_covariance: Positive = 100.0
     """[1/rad²] P₀ = p₀ I: Ĵ₀ weighs as much as a motion of 0.1 rad of each joint."""
     covariance_limit: Positive = 100.0
-    """[1/rad²] bound of the mean of P's diagonal, without which P of a joint at rest grows without bound."""
+    """[1/rad²] bound of the mean of P's diagonal."""
     min_joint_step: NonNegative = 0.01
-    """[rad] smaller motions are left out: 1 mm of noise hides them."""
+    """[rad] smaller motions are skipped as noise."""
 
     def __post_init__(self) -> None:
         """Check across fields."""

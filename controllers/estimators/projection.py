@@ -30,9 +30,9 @@ class BroydenConfig:
     """Settings of Broyden's update."""
 
     step_factor: Annotated[Positive, Le(1.0)] = 0.2
-    """[1] η; the rule has no model of noise, so a part of each motion's misfit is left for the next ones."""
+    """[1] η; below 1, as noise is not modelled."""
     min_joint_step: Positive = 0.01
-    """[rad] smaller motions are left out; 1.4 mm of noise in Δy is then at most 0.14 m/rad."""
+    """[rad] smaller motions are skipped as noise."""
 
 
 @settings
@@ -42,9 +42,9 @@ class CfdlConfig:
     step_factor: Annotated[Positive, Lt(2.0)] = 0.5
     """[1] η; half of the fastest rate."""
     regularisation: Positive = 1e-3
-    """[rad²] μ, the square of 0.03 rad: smaller motions change Φ little."""
+    """[rad²] μ, the square of 0.03 rad; smaller motions change Φ little."""
     min_joint_step: NonNegative = 0.005
-    """[rad] smaller motions are left out: 1 mm of noise hides them."""
+    """[rad] smaller motions are skipped as noise."""
     reset: bool = True
     """Return to Φ₀ when Φ loses its sign or vanishes."""
     reset_norm: Annotated[NonNegative, Only(reset=True)] = 1e-2

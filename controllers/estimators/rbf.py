@@ -25,14 +25,13 @@ class RbfConfig:
     """Settings of the update."""
 
     window: Count = 8
-    """[motions] T, from which is learned at once."""
+    """[motions] T, window learned from at once."""
     k2: Annotated[Positive, Lt(2.0)] = 0.5
     """[1] k₂, step size."""
     epsilon: NonNegative = 1e-3
-    """[rad²] ε, joint motion (squared, summed over the window) below which learning fades. It holds at
-    `REFERENCE_NOISE`; where the noise is identified it grows with its variance."""
+    """[rad²] ε, squared joint motion in the window below which learning fades; grows with identified noise."""
     leak: NonNegative = 0.0
-    """[1/s] rate at which the learned weights fade (σ-modification); 0 as in the paper."""
+    """[1/s] rate at which learned weights fade (σ-modification); 0 as in the paper."""
 
 
 def window_step(

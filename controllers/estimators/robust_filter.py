@@ -50,9 +50,9 @@ class RobustConfig(RandomWalk):
     """Settings of the robust filter of feature and Jacobian."""
 
     motion_error: NonNegative = 0.1
-    """[1] c, error of a predicted motion over its size, as of delays and of the bend of the path."""
+    """[1] c, error of a predicted motion over its size (delay, curvature of the path)."""
     min_joint_step: NonNegative = 0.002
-    """[rad] in smaller motions J does not walk."""
+    """[rad] no process noise in smaller motions."""
 
 
 class RobustState(NamedTuple):

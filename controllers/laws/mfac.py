@@ -24,8 +24,7 @@ class MfacConfig:
     """Settings of the MFAC law."""
 
     gain: PositiveOrInfinite = 3.25
-    """[1/s] K: ρ = 1 − exp(−K dt), 0.15 at 20 Hz; not the paper's ρ = 1 (`inf`), which three periods of delay make
-    unstable."""
+    """[1/s] K: ρ = 1 − exp(−K dt); the paper's ρ = 1 (`inf`) is unstable with three periods of delay."""
     step_weight: Positive = 0.02
     """[m²/rad²] λ; halves the gain where a singular value is 0.14 m/rad."""
 

@@ -32,15 +32,15 @@ class PidConfig:
     """Settings of the PID law; the defaults damp a loop with three periods of delay at 20 Hz well."""
 
     proportional_gain: Positive = 2.5
-    """[1/s] K_p; a share of 0.12 of the error per period of 0.05 s."""
+    """[1/s] K_p; 0.12 of the error per period of 0.05 s."""
     integral_gain: NonNegative = 0.0
     """[1/s²] K_i; 0 as in the paper."""
     derivative_gain: NonNegative = 0.0
     """[1] K_d; 0 as in the paper."""
     derivative_filter: Annotated[NonNegative, Only(derivative_gain=Gt(0.0))] = 0.1
-    """[s] τ, time constant of the filtered derivative; two periods at 20 Hz."""
+    """[s] τ of the filtered derivative; two periods at 20 Hz."""
     damping: NonNegative = 0.02
-    """[m/rad] δ, damping of the inverse; a tenth of the smallest singular value in a UR5's workspace."""
+    """[m/rad] δ of the inverse; a tenth of a UR5's smallest singular value."""
 
 
 class PidState(NamedTuple):

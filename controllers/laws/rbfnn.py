@@ -147,19 +147,19 @@ class RbfnnConfig:
     """Settings of the online update; the structure of the network (L_e, L_c, N_h, kernel) belongs to its training."""
 
     horizon: Count = 8
-    """[1] T, predicted steps, each as long as `training.controller.step`."""
+    """[1] T, predicted steps of `training.controller.step`."""
     k: Annotated[Positive, Lt(2.0)] = 0.1
-    """[1] share of the predicted error that the updates of one step remove; a large one is fast and little damped."""
+    """[1] share of the predicted error removed per step; large: fast and little damped."""
     epsilon: NonNegative = 1e-3
-    """[m⁴] ε; updates fade where predicted errors are millimetres."""
+    """[m⁴] ε; updates fade at predicted errors of millimetres."""
     preview: bool = True
-    """Predict with the known future of the reference; false: with its present value."""
+    """Predict with the previewed reference; false: with its present value."""
     position: Literal["measured", "commanded"] = "measured"
-    """The joint position q in ξ: as the encoders report it, or the sum of all commands as in the paper."""
+    """Joint position q in ξ: by the encoders, or the sum of all commands as in the paper."""
     offset_free: bool = False
-    """Subtract the trained command at rest instead of q: no error, no motion; not the paper's."""
+    """Subtract the trained command at rest instead of q; not the paper's."""
     row_space_only: bool = True
-    """Learn outside of the null space of Ĵ only; false as in the paper."""
+    """Learn only outside the null space of Ĵ; false as in the paper."""
     anti_windup: bool = True
     """Learn nothing that drives a limited command further; false as in the paper."""
 

@@ -27,15 +27,15 @@ class JacobianTraining:
     """How the Jacobian network is fitted."""
 
     centres: Count = 150
-    """[1] L, units of each joint column."""
+    """[1] L, units per joint column."""
     samples: Samples = 4000
     """[1] joint positions, held-out ones included."""
     placement: Placement = "halton"
     """Where the centres lie."""
     width_scales: Grid = (0.7, 1.0, 1.5)
-    """[1] δ over half the region's diagonal; the best one is chosen."""
+    """[1] δ over half the region's diagonal; the best is chosen."""
     regularisations: Grid = (1e-10, 1e-8, 1e-6)
-    """[1] of the ridge, over the largest eigenvalue; the best one is chosen."""
+    """[1] of the ridge, over the largest eigenvalue; the best is chosen."""
 
     def __post_init__(self) -> None:
         """Check across fields."""
@@ -58,15 +58,15 @@ class ControllerTraining:
     kernel: Kernel = "exponential"
     """Of eq. 16; "gaussian" squares the norm."""
     step: Positive = STEP
-    """[s] s, step of the network's commands, at any control period; the paper's is the control period."""
+    """[s] s, step of the network's commands at any control period."""
     gain: Positive = 3.0
-    """[1/s] K_p of the law that is imitated."""
+    """[1/s] K_p of the imitated law."""
     damping: NonNegative = 0.0
-    """[m/rad] δ of the imitated law's inverse; 0: J⁺ without directions below a tenth of the strongest."""
+    """[m/rad] δ of its inverse; 0: directions below a tenth of the strongest are dropped."""
     posture_gain: Annotated[NonNegative, Only(fit="output")] = 0.5
-    """[1/s] K_n, towards the region's middle in the null space; 0 as in the paper."""
+    """[1/s] K_n of null-space centring; 0 as in the paper."""
     fit: Literal["output", "entries"] = "output"
-    """Target of the fit: the product ψ ξ, or the entries of ψ as the paper reads."""
+    """Target of the fit: ψ ξ, or the entries of ψ as in the paper."""
     error_range: Positive = 0.5
     """[m] largest error per axis."""
     samples: Samples = 6000
@@ -74,9 +74,9 @@ class ControllerTraining:
     placement: Placement = "halton"
     """Where the centres lie."""
     width_scales: Grid = (2.0, 4.0, 8.0)
-    """[1] reach of a unit over the spread of ξ; the best one is chosen."""
+    """[1] reach of a unit over the spread of ξ; the best is chosen."""
     regularisations: Grid = (1e-12, 1e-10, 1e-8)
-    """[1] of the ridge, over the largest eigenvalue; the best one is chosen."""
+    """[1] of the ridge, over the largest eigenvalue; the best is chosen."""
 
     def __post_init__(self) -> None:
         """Check across fields."""
@@ -91,13 +91,13 @@ class TrainingConfig:
     """Settings of both fits; an empty region means the one in which the robot will work."""
 
     lower: tuple[Number, ...] = ()
-    """[rad] lower corner of the region, a number per joint."""
+    """[rad] lower corner of the region, by joint."""
     upper: tuple[Number, ...] = ()
-    """[rad] upper corner of the region, a number per joint."""
+    """[rad] upper corner of the region, by joint."""
     seed: Periods = 0
-    """[1] of the samples; independent of any run."""
+    """[1] of the samples."""
     held_out: Annotated[Positive, Lt(1.0)] = 0.2
-    """[1] share of the samples on which widths and regularisation are chosen."""
+    """[1] share of samples on which widths and regularisation are chosen."""
     jacobian: JacobianTraining = nested(JacobianTraining)
     """Fit of the Jacobian network."""
     controller: ControllerTraining = nested(ControllerTraining)

@@ -48,53 +48,53 @@ class SensingConfig:
     """Settings of the path from the true feature to the observation."""
 
     feature_noise: Extent = 0.001
-    """[m or px] standard deviation σ of the noise of each component, such as 1mm or 2px; of pixels in metres, their
-    size in the planned image."""
+    """[m or px] standard deviation σ of each component, such as 1mm or 2px; pixels in metres: their size in the planned
+    image."""
     latency: Delay = 0.0
-    """[s] between exposure and delivery of a frame; rounded by 0.5 ms at most where the control period needs it."""
+    """[s] from exposure to delivery; rounded by at most 0.5 ms to fit the period."""
     drop_probability: ShareBelowOne = 0.0
-    """[1] chance that a frame is lost, independently of the others."""
+    """[1] probability that a frame is lost."""
     noise_factor: Annotated[NonNegative, Usual(20.0)] = 1.0
-    """[1] factor on all noise of the sensor, for studies of noise."""
+    """[1] factor on all sensor noise."""
     frame_period: Delay = 0.0
-    """[s] between two frames, from the start of the run on; 0: a frame arrives at every control instant."""
+    """[s] between two frames; 0: a frame at every control instant."""
     jitter: Delay = 0.0
-    """[s] J: each frame is late by U(0, J) in addition to the latency; frames do not overtake each other."""
+    """[s] J; each frame is late by a further U(0, J), without overtaking."""
     noise: Family = "white"
     """Family of the noise of each component."""
     noise_shape: tuple[tuple[Number, ...], ...] = ()
-    """[1] rows of a matrix L by which the noise is multiplied; empty for the identity."""
+    """[1] rows of a matrix L that multiplies the noise; empty: identity."""
     noise_share: Annotated[Share, Only(noise=("mixture", "bimodal"))] = 0.1
-    """[1] ρ, share of the noise that is displaced."""
+    """[1] ρ, displaced share, for "mixture" and "bimodal"."""
     noise_offset: Annotated[Extent, Only(noise=("mixture", "bimodal"))] = 0.02
-    """[m or px] μ, by how much it is displaced."""
+    """[m or px] μ, displacement."""
     noise_spread: Annotated[Positive, Only(noise="mixture")] = 1.0
-    """[1] κ, deviation of the displaced part over σ."""
+    """[1] κ, deviation of the displaced part of "mixture", over σ."""
     # Below 0.5 the numbers tell nothing.
     stability: Annotated[float, Ge(0.5), Le(2.0), Only(noise="stable")] = 1.5
-    """[1] α, exponent of the family: 2 is white, 1 is Cauchy."""
+    """[1] α of "stable": 2 is white, 1 Cauchy."""
     skewness: Annotated[float, Ge(-1.0), Le(1.0), Only(noise="stable")] = 0.0
-    """[1] β, skewness of the family."""
+    """[1] β of "stable"."""
     quantum: Extent = 0.0
-    """[m or px] the feature is rounded to multiples of it; 0: it is not."""
+    """[m or px] quantisation step of the feature; 0: none."""
     outliers: ShareBelowOne = 0.0
-    """[1] share of the frames that are outliers: the feature is seen elsewhere."""
+    """[1] share of frames in which the feature is detected elsewhere."""
     outlier_size: Annotated[Extent, Only(outliers=Gt(0.0))] = 0.05
-    """[m or px] distance of an outlier, in a direction drawn at random."""
+    """[m or px] distance of an outlier, in a random direction."""
     outlier_duration: Annotated[Delay, Only(outliers=Gt(0.0))] = 0.0
-    """[s] how long an outlier stays where it is; 0: one frame."""
+    """[s] how long an outlier persists; 0: one frame."""
     occlusions: ShareBelowOne = 0.0
-    """[1] share of the frames in which the feature is hidden, at random times."""
+    """[1] share of frames in which the feature is hidden, at random times."""
     occlusion_duration: Annotated[Positive, Usual(10.0), Only(occlusions=Gt(0.0))] = 0.5
-    """[s] length of each of these occlusions."""
+    """[s] length of each occlusion."""
     occlusion_windows: tuple[tuple[Number, Number], ...] = ()
-    """[s] further occlusions: begin (included, above 0) and end (excluded) of each."""
+    """[s] further occlusions: begin (included, above 0) and end (excluded)."""
     latency_swing: Delay = 0.0
-    """[s] A: a frame exposed at t is late by A (1 + sin(2π t/P)) in addition to the latency."""
+    """[s] A; a frame exposed at t is late by a further A (1 + sin(2π t/P))."""
     swing_period: Annotated[Positive, Usual(100.0), Only(latency_swing=Gt(0.0))] = 4.0
     """[s] P of this swing."""
     camera_turn: Annotated[NonNegative, Usual(3.2)] = 0.0
-    """[rad/s] the first camera turns about its optical axis, from its pose at the start on."""
+    """[rad/s] turning rate of the first camera about its optical axis."""
 
     def __post_init__(self) -> None:
         """Check the windows."""

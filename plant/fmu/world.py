@@ -74,11 +74,11 @@ class FmuConfig:
     """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
 
     command_delay: Delay = 0.05
-    """[s] between a command and its first effect; rounded by 0.5 ms at most where the control period needs it."""
+    """[s] from command to first effect; rounded by at most 0.5 ms to fit the period."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
     isolate: bool = True
-    """Carry its runs out in a process of their own, with limits; false for an FMU that you trust like servobench."""
+    """Run the FMU in a process of its own, with limits; false only for one that you trust."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ class DriveConfig:
     """Settings of the joints' drives: lists have one number for all joints or one for each."""
 
     dynamics: bool = True
-    """Torque-driven joints; without it they follow the lag exactly."""
+    """Torque-driven joints; false: joints follow the lag exactly."""
     velocity_bandwidth: Annotated[tuple[Positive, ...], Only(dynamics=True)] = (
         15.0,
         15.0,
@@ -51,11 +51,11 @@ class DriveConfig:
         20.0,
         20.0,
     )
-    """[Hz] of each velocity loop; in no data sheet: chosen so that joints rise in about 50 ms, as on `kinematic`."""
+    """[Hz] of each velocity loop; rises in about 50 ms."""
     torque_limit: Annotated[tuple[Positive, ...], Only(dynamics=True)] = ur5.MAX_TORQUE
-    """[Nm] of each joint, by its maker; these of Universal Robots, "Max. joint torques"."""
+    """[Nm] of each joint; Universal Robots, "Max. joint torques"."""
     rotor_inertia: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (0.1,)
-    """[kg m²] of the rotor, times the gear's ratio squared; that of the UR5e in MuJoCo Menagerie, in no data sheet."""
+    """[kg m²] seen at the joint (rotor times gear ratio squared); UR5e in MuJoCo Menagerie."""
     coulomb_friction: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (
         7.5,
         7.5,
@@ -64,7 +64,7 @@ class DriveConfig:
         1.4,
         1.4,
     )
-    """[Nm] 5 % of the torque limit; an order of magnitude for strain-wave gears, in no data sheet."""
+    """[Nm] 5 % of the torque limit; order of magnitude for strain-wave gears."""
     viscous_friction: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (
         7.5,
         7.5,
@@ -73,13 +73,13 @@ class DriveConfig:
         1.4,
         1.4,
     )
-    """[Nm s/rad] at 1 rad/s as much as Coulomb friction; an order of magnitude, too."""
+    """[Nm s/rad] at 1 rad/s as much as Coulomb friction."""
     friction_compensation: Annotated[Share, Only(dynamics=True)] = 0.8
-    """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
+    """[1] share of the friction, by the reference's speed; 0.7 to 0.9 in Universal Robots' torque control."""
     payload: Annotated[Load, Only(dynamics=True)] = 2.5
-    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and its load."""
+    """[kg] true load, a point mass at the ball; half of the UR5's rated 5 kg."""
     assumed_payload: Annotated[Load, Only(dynamics=True)] = 0.9
-    """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
+    """[kg] load assumed in gravity compensation: the gripper alone (Robotiq 2F-85)."""
 
     def check(self, n: int) -> None:
         """Refuse lists that do not fit `n` joints.
@@ -130,43 +130,43 @@ class RenderedConfig:
     """Settings of a rendered plant; the defaults of loads and drives are a UR5's, and change with the robot."""
 
     max_joint_speed: JointSpeed = 1.0
-    """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
+    """[rad/s] limit of every joint, besides its maker's (UR5: π)."""
     joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
-    """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
+    """[rad] largest joint position each way, besides its maker's limits."""
     lag: Delay = 0.05
-    """[s] τ, by which the drives smooth the commanded velocity; 0 means none."""
+    """[s] τ, by which the drives smooth the commanded velocity; 0: none."""
     drives: DriveConfig = nested(DriveConfig)
     """Loops, torque limits, friction and load of the joints."""
     encoder_resolution: NonNegative = 2 * math.pi / 2**17
-    """[rad] step of reported positions, 0 for none; 17 bits, 0.04 mm at the reach of 0.85 m, below the UR5's 0.1 mm."""
+    """[rad] step of reported positions, 0: exact; 17 bits."""
     room_contact: bool = True
-    """End the run, as `collision`, when the arm meets the table, the floor or an obstacle."""
+    """End the run (`collision`) when the arm meets table, floor or obstacle."""
     self_contact: bool = False
-    """The same when the arm meets itself; off, as the task `circle` leads the wrist 70 mm into the upper arm."""
+    """The same when the arm meets itself."""
     obstacles: tuple[BoxNumbers, ...] = ()
-    """[m] boxes that hide the ball and stand in the way: x, y, z of the centre in the base frame, and three sides."""
+    """[m] boxes that occlude and collide: centre x, y, z in the base frame, and three sides."""
     command_delay: Delay = 0.0
-    """[s] between a command and its first effect; rounded by 0.5 ms at most where the control period needs it."""
+    """[s] from command to first effect; rounded by at most 0.5 ms to fit the period."""
     sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 0.05, 0.002))
     """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""
     depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"
     """Model of the depth noise."""
     depth_subpixel: Annotated[NonNegative, Only(depth_noise="stereo")] = 0.08
-    """[px] RMS disparity error of a stereo match; vendor's white paper."""
+    """[px] RMS disparity error of a stereo match; vendor's figure."""
     depth_baseline: Annotated[Positive, Only(depth_noise="stereo")] = 0.05
     """[m] between the two imagers; RealSense D435."""
     native_width: Annotated[Count, Only(depth_noise=("stereo", "structured_light"))] = 848
-    """[px] width at which the depth sensor matches; optimum of the RealSense D435."""
+    """[px] image width of the stereo match; RealSense D435."""
     depth_patch: Annotated[NonNegative, Only(depth_noise=("stereo", "structured_light"))] = 9.0
-    """[px] side of the matched patch at `native_width`, over which depths share their error; 0 means white noise."""
+    """[px] patch at `native_width` over which depths share their error; 0: white noise."""
     depth_quantisation: NonNegative = 0.001
-    """[m] depth unit of the sensor; 0 means none."""
+    """[m] depth unit; 0: none."""
     colour_noise: NonNegative = 2.5
-    """[of 255] deviation of each channel of each pixel: shot noise of a pixel with a full well of 10,000 electrons."""
+    """[of 255] deviation of each channel: shot noise with a full well of 10,000 electrons."""
     scenery: bool = True
-    """Draw the table and the floor; without them a frame costs a fifth."""
+    """Draw table and floor; without them a frame costs a fifth."""
     view: bool = False
-    """Open a window and run in real time; with PyBullet only."""
+    """Open a window and run in real time; PyBullet only."""
 
     def boxes(self) -> tuple[Box, ...]:
         """Return the obstacles."""

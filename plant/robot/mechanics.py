@@ -41,11 +41,11 @@ class MechanicsConfig:
     """Settings of gears and tool; all off by default."""
 
     backlash: Annotated[NonNegative, Usual(0.2)] = 0.0
-    """[rad] b: half of the play between each gear and its joint."""
+    """[rad] b, half the play between gear and joint."""
     ripple: Annotated[NonNegative, Usual(0.2)] = 0.0
-    """[rad] a: each gear leads by a sin(k q)."""
+    """[rad] a; each gear leads by a sin(k q)."""
     ripple_order: Annotated[Positive, Only(ripple=Gt(0.0))] = 8.0
-    """[1] k, periods of the ripple in a turn."""
+    """[1] k, ripple periods per turn."""
     tool_frequency: NonNegative = 0.0
     """[rad/s] ω, natural frequency of a flexible tool; 0: rigid."""
     tool_damping: Annotated[ShareBelowOne, Only(tool_frequency=Gt(0.0))] = 0.02

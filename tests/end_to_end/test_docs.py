@@ -350,7 +350,7 @@ def test_the_table_of_equations_has_each_once_and_the_code_names_it_too():
         rows for _, header, rows in tables(read("methods_reference.md")) if header[0] == "equation"
     )
     assert sorted(number for row in rows for number in numbers(row[0])) == list(range(1, 47))
-    for equations, _, where in rows:
+    for equations, where in rows:
         for path, _ in PLACE.findall(where):
             text = (ROOT / path).read_text(encoding="utf-8")
             told = {

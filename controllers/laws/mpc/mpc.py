@@ -42,35 +42,35 @@ class MpcConfig:
     """Settings of the predictive law; "tuned" = on UR5s with ±15° camera, ±5 % links and 3 periods of delay."""
 
     horizon_time: Positive = 0.5
-    """[s] how far the prediction reaches; tuned."""
+    """[s] prediction horizon; tuned."""
     moves: Count = 10
-    """[1] H, equal blocks of constant joint velocity in the horizon; fewer where they were shorter than a period."""
+    """[1] H, equal blocks of constant joint velocity, none shorter than a period."""
     mode: Literal["moves", "constant"] = "moves"
     """H free moves, or one constant velocity as in the paper."""
     forgetting: NonNegative = 0.0
-    """[1/s] an error weighs exp(−forgetting t) after the time t; 0 is the plain mean."""
+    """[1/s] weight exp(−forgetting t) of an error after t; 0: plain mean."""
     decay: Positive = 5.0
-    """[1/s] the error should decay as exp(−decay t); tuned."""
+    """[1/s] desired decay exp(−decay t) of the error; tuned."""
     move_weight: Positive = 0.15
-    """[m²/rad²] q of Q = q I, for the joint step of 0.05 s; converted for blocks of another length; tuned."""
+    """[m²/rad²] q of Q = q I, for a joint step of 0.05 s, converted for other blocks; tuned."""
     joint_weight: tuple[Positive, ...] = ()
-    """[1] relative weight of each joint, Q = q diag(…); empty: all 1."""
+    """[1] weight of each joint, Q = q diag(…); empty: all 1."""
     terminal_weight: NonNegative = 0.0
-    """[1] extra weight of the error at the end, against that of 0.05 s; 0 is the paper's criterion."""
+    """[1] extra weight of the final error, against that of 0.05 s."""
     use_preview: bool = True
-    """Follow the previewed reference; false: hold the present one, as in the paper."""
+    """Follow the previewed reference; false: its present value, as in the paper."""
     delay: NonNegative = 0.0
-    """[s] until a command shows in the feature; bridged by the commands already sent."""
+    """[s] from command to feature, bridged by the commands already sent."""
     joint_acceleration_limit: PositiveOrInfinite = math.inf
-    """[rad/s²] limit of the change between two commands; inf: none."""
+    """[rad/s²] limit between two commands; inf: none."""
     limit_position: bool = True
-    """Keep the predicted joint positions within the plant's limits."""
+    """Keep predicted joint positions within the plant's limits."""
     view_tangent: tuple[Positive, ...] = ()
-    """[1] (horizontal, vertical): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty: no limit."""
+    """[1] (h, v): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty: no limit."""
     solver: Solver = "daqp"
-    """Solver of the quadratic programs; "qpoases" for a cross-check."""
+    """QP solver; "qpoases" for a cross-check."""
     fallback: Literal["hold", "closed_form", "raise"] = "hold"
-    """Without a solution: zero velocity, the law without limits scaled to the speed limit, or `SolverFailed`."""
+    """Without a solution: zero velocity, the scaled unlimited law, or `SolverFailed`."""
 
     def __post_init__(self) -> None:
         """Check across fields."""
