@@ -38,7 +38,6 @@ LEFT_OUT = {  # words of a block -> why it is not carried out
 if generated_tables.RELEASED:
     LEFT_OUT["-m venv"] = "every release is installed into a fresh environment, by make release"
 LONG = {  # words of a block that only `make nightly` carries out -> processor time [s]
-    "servobench record --robot panda": 90,
     "nominal_rate,nominal_broyden": 25,
     "--sensing all": 20,
     "fmu export --controller": 12,

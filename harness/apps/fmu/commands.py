@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
 from servobench.harness.cli.terminal import FAILED, print_rows, say
@@ -18,6 +17,7 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.files import accessing
 
 if TYPE_CHECKING:
+    from servobench.fmus.compiler import Platform
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
 
@@ -47,6 +47,8 @@ class Export:
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
+        from servobench.fmus.compiler import parse_platforms
+
         with configuration_errors(), accessing(None):
             yield parse_platforms(self.platforms)
 
