@@ -61,10 +61,11 @@ class AidsConfig:
     filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
     """Subtract the noise that the regression finds in the last frame."""
     model: Annotated[
-        Literal["own", "nominal", "regression"],
+        Literal["own", "nominal", "regression", "arm"],
         Switch("regression", tuned=("own", "nominal", "regression")),
     ] = "own"
-    """What the estimator learns: the Jacobian, or its deviation from the nominal one or from a regression on it."""
+    """What the estimator learns: the Jacobian, or its deviation from the nominal one, from a regression on it, or from
+    the nominal arm whose parameters are fitted ("arm", self-calibration) while that predicts better."""
     feedforward: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
     """Feedforward of the reference's motion; needs a preview."""
     posture: Annotated[bool, Switch(equipped=True)] = False
@@ -91,7 +92,7 @@ class AidsConfig:
             response=("identified", "given"),
             noise="identified",
             filter=True,
-            model=("nominal", "regression"),
+            model=("nominal", "regression", "arm"),
         ),
     ] = 0.001
     """[m] standard deviation, of pixels too; the first guess if identified."""

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.signals import Command, Observation, PlantSpec
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
@@ -43,6 +44,7 @@ class RobotKnowledge:
         preview: number of future rows that `reference` has after row 0.
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
+        nominal_model: the features of the nominal robot by its parameters; None where no model exists.
         true_jacobian: the same of the true robot; given only to a controller whose entry needs the truth.
         true_symbolic: a CasADi expression (MX) q, (n, 1) rad -> the expression of the true robot's feature, (m, 1);
             under the same condition.
@@ -59,6 +61,7 @@ class RobotKnowledge:
     spec: PlantSpec
     preview: int
     nominal_jacobian: JacobianFunction | None = None
+    nominal_model: FeatureModel | None = None
     true_jacobian: JacobianFunction | None = None
     true_symbolic: SymbolicFeature | None = None
     true_delays: Delays | None = None

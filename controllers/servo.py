@@ -16,9 +16,10 @@ from servobench.controllers.controller import Controller, Delays, Diagnostics, R
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial_jacobian import InitialJacobian
 from servobench.controllers.laws.law import Estimate, Law
-from servobench.controllers.stages.estimation import Estimation, EstimationState
+from servobench.controllers.stages.calibration import Ahead, Calibration, CalibrationState
+from servobench.controllers.stages.estimation import REGRESSED, Estimation, EstimationState
 from servobench.controllers.stages.finish import Finish
-from servobench.controllers.stages.prediction import Predictor, shifted
+from servobench.controllers.stages.prediction import Predictor, PredictorState, shifted
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch
@@ -34,6 +35,7 @@ class ServoState(NamedTuple):
     predictor: Any  # state of the predict stage; None without one
     ready: BoolArray  # (...), whether the initial Jacobian is known
     limited: BoolArray  # (...), whether the last command was limited
+    calibration: CalibrationState | None  # state of the calibrating stage; None without one
 
     @property
     def jacobian(self) -> FloatArray:
@@ -91,9 +93,10 @@ class Servo:
         self.initial = initial
         self.estimation = Estimation(estimator, knowledge, aids, delays)
         self.predictor = Predictor(aids, knowledge.spec.period, delays) if predicts else None
+        self.calibration = _calibration(aids, knowledge, predicts=predicts)
         self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
         self._feeds_forward = aids.feedforward
-        self._turns = law.in_model_frame and aids.model == "regression"
+        self._turns = law.in_model_frame and aids.model in REGRESSED
         # Feedforward needs the row of the next instant, too.
         self._rows = 1 + int(aids.feedforward)
         if "preview" in law.owns:
@@ -159,6 +162,7 @@ class Servo:
             predictor=None if self.predictor is None else self.predictor.start(observation),
             ready=ready,
             limited=np.zeros_like(ready)[()],
+            calibration=None if self.calibration is None else self.calibration.start(observation),
         )
 
     def _act(self, stepped: Stepped, observation: Observation, reference: FloatArray) -> Stepped:
@@ -173,11 +177,28 @@ class Servo:
         predictor = state.predictor
         ahead = observation
         later = reference
+        calibration = state.calibration
+        drift: FloatArray = np.zeros(())
         if self.predictor is not None:
             predictor, ahead, lead, J = self.predictor.predict(
                 predictor, self.estimation, estimation, observation
             )
             later = shifted(reference, lead, self._rows)
+            if self.calibration is not None:
+                calibration = self._calibrated(state, estimation, predictor, observation)
+                seen = Ahead(ahead.feature, J, np.zeros_like(ahead.feature))
+                seen = branch(
+                    calibration.used,
+                    self._believed,
+                    seen,
+                    calibration,
+                    ahead.joint_position,
+                    lead,
+                    observation.time,
+                )
+                ahead = ahead.with_values(ahead.joint_position, seen.feature)
+                J = seen.jacobian
+                drift = seen.drift
         law, wanted = self._command(state, estimation, J, ahead, later)
         if not is_finite(wanted):
             raise ControllerDiverged(
@@ -186,14 +207,50 @@ class Servo:
             )
         forward: FloatArray = np.zeros(())
         if self._feeds_forward:
-            forward = later[..., 1, :] - later[..., 0, :]
+            forward = later[..., 1, :] - later[..., 0, :] - drift
         u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
         u = self.law.restrained(law, wanted, u)
         law = self.law.noted(law, u, limited)
         if self.predictor is not None:
             predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)
-        new = ServoState(estimation, law, state.initial, predictor, state.ready, limited)
+        new = ServoState(
+            estimation, law, state.initial, predictor, state.ready, limited, calibration
+        )
         return Stepped(new, u)
+
+    def _calibrated(
+        self,
+        state: ServoState,
+        estimation: EstimationState,
+        predictor: PredictorState,
+        observation: Observation,
+    ) -> CalibrationState:
+        """Return the state of the calibrating stage at an observation."""
+        pairing = self.estimation.pairing
+        if self.calibration is None or pairing is None or state.calibration is None:
+            raise ValueError("aids: model='arm' needs the pair stage")
+        pair = estimation.learned.pair
+        due = np.equal(estimation.last.time, observation.time)
+        regression = (
+            predictor.feature,
+            estimation.jacobian,
+            pairing.delay(pair) * self.knowledge.spec.period,
+            pair.noise.deviation,
+        )
+        return self.calibration.update(state.calibration, observation, due, regression)
+
+    def _believed(
+        self,
+        _: Ahead,
+        calibration: CalibrationState,
+        bound: FloatArray,
+        lead: FloatArray,
+        time: float,
+    ) -> Ahead:
+        """Return the prediction of the calibrated arm in lanes where it is believed."""
+        if self.calibration is None:
+            raise ValueError("aids: there is no calibrating stage")
+        return self.calibration.ahead(calibration, bound, lead, time)
 
     def _command(
         self,
@@ -222,10 +279,31 @@ class Servo:
         own: dict[str, Any] = {"probing": 1.0 - state.ready, "saturated": state.limited}
         if self.predictor is not None:
             own["lead"] = state.predictor.response.lead * self.knowledge.spec.period
+        if self.calibration is not None and state.calibration is not None:
+            own.update(self.calibration.diagnostics(state.calibration))
         estimation = self.estimation.diagnostics(state.estimation)
         if not np.any(state.ready):
             return {**own, "jacobian_prediction_error": estimation["jacobian_prediction_error"]}
         return {**own, **estimation, **self.law.diagnostics(state.law)}
+
+
+def _calibration(
+    aids: AidsConfig, knowledge: RobotKnowledge, *, predicts: bool
+) -> Calibration | None:
+    """Return the calibrating stage, if an aid asks for it.
+
+    Raises:
+        ValueError: there is no model of the robot, or no stage that predicts.
+    """
+    if aids.model != "arm":
+        return None
+    if knowledge.nominal_model is None:
+        raise ValueError(
+            "aids.model: 'arm' needs the geometry of the robot, which is not known here"
+        )
+    if not predicts:
+        raise ValueError("aids.model: 'arm' needs aids.response or aids.filter")
+    return Calibration(knowledge, knowledge.nominal_model)
 
 
 @final

@@ -24,6 +24,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.signals import BoolArray, Observation
 
+REGRESSED = ("regression", "arm")  # models with a regression on the nominal Jacobian
+
 
 class LastFrame(NamedTuple):
     """The frame at which the last motion ended."""
@@ -205,7 +207,7 @@ class Estimation:
         """Return Ĵ at joint positions, (..., m, n), for the estimator's own part and J_n there."""
         if self._model == "own" or self.pairing is None:
             return own
-        if self._model == "regression":
+        if self._model in REGRESSED:
             nominal = self.pairing.regression.jacobian(
                 learned.pair.regression, joint_position, nominal
             )
@@ -241,7 +243,7 @@ class Estimation:
                 dy = dy - (pair.regression.mean[..., -1] - paired.before.mean[..., -1])
             if self._model == "nominal":
                 explained = paired.predicted
-            elif self._model == "regression":
+            elif self._model in REGRESSED:
                 explained = self.pairing.regression.explained(paired.before, paired.h)
             if self._first is not None:
                 explained = explained - np.matvec(self.estimator.jacobian(self._first, q), dq)

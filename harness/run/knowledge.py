@@ -17,6 +17,7 @@ from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.parametric import ParametricModel
 from servobench.plant.robot.robot import Robot
 
 FILE = "networks.npz"
@@ -39,7 +40,9 @@ def nominal_knowledge(
         )
         return knowledge, knowledge
     region = robot.workspace.lower, robot.workspace.upper
-    knowledge = RobotKnowledge(spec, run.preview_rows, nominal.jacobian, region=region)
+    knowledge = RobotKnowledge(
+        spec, run.preview_rows, nominal.jacobian, ParametricModel(nominal), region=region
+    )
     if nominal is robot.nominal:
         return knowledge, knowledge
     return knowledge, replace(

@@ -365,10 +365,31 @@ class SetupModel(RobotModel):
         optical_axis = self.camera[..., :3, 2]
         return position + self.distance * optical_axis
 
-    def points(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return the target in the frame that the cameras are mounted on, (..., p, 3) m."""
-        flange = self.arm.frames(joint_position)[..., -1, :, :]
-        return self._mounted(flange, self._in_base(flange))
+    @property
+    def poses(self) -> FloatArray:
+        """The poses of the cameras, (..., c, 4, 4)."""
+        return self.cameras
+
+    @property
+    def marks(self) -> FloatArray:
+        """The points of the target, (..., p, 3) m."""
+        return self.target
+
+    def rebuilt(self, arm: SerialArm, cameras: FloatArray) -> Self:
+        """Return this model with another arm and its cameras at poses (..., c, 4, 4)."""
+        return replace(self.with_arm(arm), cameras=cameras)
+
+    def with_target(self, points: FloatArray) -> Self:
+        """Return this model with other points of the target, (..., p, 3) m."""
+        return replace(self, target=points)
+
+    def measure(self, points: FloatArray) -> FloatArray:
+        """Return the features, (..., m), of points in the frame of each camera, (..., c, p, 3) m."""
+        return self.setup.measure(points, self.optics)
+
+    def change(self, points: FloatArray, motions: FloatArray) -> FloatArray:
+        """Return how the features change, (..., m, k), with motions of these points, (..., c, p, 3, k) m."""
+        return self.setup.change(points, motions, self.optics)
 
     def feature_at(self, points: FloatArray) -> FloatArray:
         """Return the features, (..., m), of a target at `points` (..., p, 3) m in the frame of the cameras' mount."""
@@ -404,13 +425,13 @@ class SetupModel(RobotModel):
         """Return the target in each camera, (..., c, p, 3) m, and its motion with the joints, (..., c, p, 3, n)."""
         frames = self.arm.frames(joint_position)
         flange = frames[..., -1, :, :]
-        target = self._in_base(flange)
+        target = self.in_base(flange)
         motions = self.arm.motions(frames, target)
         if self.mount == "hand":
             # Seen from the hand, the target moves by −R_Fᵀ (g_i z_i × (t − o_i)).
             R_BF = flange[..., None, None, :3, :3]
             motions = -np.vecmat(motions, R_BF)
-        points = self.in_cameras(self._mounted(flange, target))
+        points = self.in_cameras(self.mounted(flange, target))
         # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
         rotations = self.cameras[..., None, None, :3, :3]
         turned = np.vecmat(motions[..., None, :, :, :], rotations)
@@ -421,28 +442,6 @@ class SetupModel(RobotModel):
         front = _incidence(points) > MIN_INCIDENCE
         inside = in_image(points, self.optics, share)
         return self.setup.valid(np.logical_and(inside, front[..., None]))
-
-    def _in_base(self, flange: FloatArray) -> FloatArray:
-        """Return the target in the base frame, (..., p, 3) m."""
-        if self.mount == "hand":
-            return self.target
-        R_BF = flange[..., None, :3, :3]
-        p_BF = flange[..., None, :3, 3]
-        return np.asarray(np.matvec(R_BF, self.target) + p_BF)
-
-    def _mounted(self, flange: FloatArray, points: FloatArray) -> FloatArray:
-        """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
-        if self.mount == "fixed":
-            return points
-        R_BF = flange[..., None, :3, :3]
-        p_BF = flange[..., None, :3, 3]
-        return np.asarray(np.vecmat(points - p_BF, R_BF))
-
-    def in_cameras(self, points: FloatArray) -> FloatArray:
-        """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
-        cameras = self.cameras[..., None, :, :]
-        from_camera = points[..., None, :, :] - cameras[..., :3, 3]
-        return np.asarray(np.vecmat(from_camera, cameras[..., :3, :3]))
 
 
 def _incidence(points: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ The robots of many runs side by side are one model, whose arrays have leading ax
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import ClassVar, Final, Self
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,8 @@ class RobotModel(ABC):
 
     arm: SerialArm
     """The arm."""
+    mount: Literal["fixed", "hand"]
+    """Whether the cameras are beside the arm and the target on it, or the reverse."""
 
     @property
     def lead(self) -> tuple[int, ...]:
@@ -61,6 +63,59 @@ class RobotModel(ABC):
     @abstractmethod
     def with_arm(self, arm: SerialArm) -> Self:
         """Return this model with another arm, and the target on its flange where that arm's tool is."""
+
+    @property
+    @abstractmethod
+    def poses(self) -> FloatArray:
+        """The poses of all cameras, (..., c, 4, 4), in the frame of their mount."""
+
+    @property
+    @abstractmethod
+    def marks(self) -> FloatArray:
+        """The points of the target, (..., p, 3) m, in the flange frame; with cameras on the hand in the base frame."""
+
+    @abstractmethod
+    def rebuilt(self, arm: SerialArm, cameras: FloatArray) -> Self:
+        """Return this model with another arm (`with_arm`) and its cameras at poses (..., c, 4, 4) of the same axes."""
+
+    @abstractmethod
+    def with_target(self, points: FloatArray) -> Self:
+        """Return this model with other points of the target, (..., p, 3) m."""
+
+    @abstractmethod
+    def measure(self, points: FloatArray) -> FloatArray:
+        """Return the features, (..., m), of the target's points in the frame of each camera, (..., c, p, 3) m."""
+
+    @abstractmethod
+    def change(self, points: FloatArray, motions: FloatArray) -> FloatArray:
+        """Return how the features change, (..., m, k), with k motions of these points, (..., c, p, 3, k) m."""
+
+    def points(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the target in the frame that the cameras are mounted on, (..., p, 3) m."""
+        flange = self.arm.frames(joint_position)[..., -1, :, :]
+        return self.mounted(flange, self.in_base(flange))
+
+    def in_base(self, flange: FloatArray) -> FloatArray:
+        """Return the target in the base frame, (..., p, 3) m, for poses of the flange, (..., 4, 4)."""
+        if self.mount == "hand":
+            return self.marks
+        R_BF = flange[..., None, :3, :3]
+        p_BF = flange[..., None, :3, 3]
+        return np.asarray(np.matvec(R_BF, self.marks) + p_BF)
+
+    def mounted(self, flange: FloatArray, points: FloatArray) -> FloatArray:
+        """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
+        if self.mount == "fixed":
+            return points
+        R_BF = flange[..., None, :3, :3]
+        p_BF = flange[..., None, :3, 3]
+        return np.asarray(np.vecmat(points - p_BF, R_BF))
+
+    def in_cameras(self, points: FloatArray) -> FloatArray:
+        """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
+        cameras = self.poses[..., None, :, :]
+        from_camera = points[..., None, :, :] - cameras[..., :3, 3]
+        return np.asarray(np.vecmat(from_camera, cameras[..., :3, :3]))
 
     def with_lens(self, deviation: FloatArray) -> Self:
         """Return this model with deviating intrinsics, 1 + focal, centre [px] and distortion, (4,), if it has any."""
@@ -173,10 +228,13 @@ class HandEyeModel(RobotModel):
     arm: SerialArm  # the arm with the ball on its flange
     X_BC: FloatArray  # (..., 4, 4), camera in the base frame; z along the optical axis, x right and y down in the image
     channel: ClassVar[Channel] = FEATURE  # names, unit and natural size of the ball's coordinates
+    mount: Literal["fixed"] = field(default="fixed", init=False)  # the ball is on the arm
 
     def __post_init__(self) -> None:
         """Check that the camera pose is a rigid transform and freeze it."""
-        pose = as_array("X_BC", self.X_BC, (*self.lead, 4, 4))
+        # One arm may stand for many: its camera may have longer axes than it has itself.
+        lead = np.broadcast_shapes(self.lead, np.shape(self.X_BC)[:-2])
+        pose = as_array("X_BC", self.X_BC, (*lead, 4, 4))
         R = pose[..., :3, :3]
         product = R @ np.swapaxes(R, -1, -2)
         deviation = np.abs(product - np.eye(3)).max(initial=0.0)
@@ -193,6 +251,33 @@ class HandEyeModel(RobotModel):
     def with_camera(self, pose: FloatArray) -> Self:
         """Return this model with the camera at another pose, (..., 4, 4)."""
         return replace(self, X_BC=pose)
+
+    @property
+    def poses(self) -> FloatArray:
+        """The pose of the camera alone, (..., 1, 4, 4)."""
+        return self.X_BC[..., None, :, :]
+
+    @property
+    def marks(self) -> FloatArray:
+        """The ball alone, (..., 1, 3) m."""
+        return self.arm.tool[..., None, :]
+
+    def rebuilt(self, arm: SerialArm, cameras: FloatArray) -> Self:
+        """Return this model with another arm and the camera at a pose, (..., 1, 4, 4)."""
+        return replace(self, arm=arm, X_BC=cameras[..., 0, :, :])
+
+    def with_target(self, points: FloatArray) -> Self:
+        """Return this model with the ball at another place of the flange, (..., 1, 3) m."""
+        return replace(self, arm=replace(self.arm, tool=points[..., 0, :]))
+
+    def measure(self, points: FloatArray) -> FloatArray:
+        """Return the ball in the camera frame, (..., 3) m."""
+        return points[..., 0, 0, :]
+
+    def change(self, points: FloatArray, motions: FloatArray) -> FloatArray:
+        """Return its motions, (..., 3, k) m."""
+        del points
+        return motions[..., 0, 0, :, :]
 
     def with_arm(self, arm: SerialArm) -> Self:
         """Return this model with another arm."""

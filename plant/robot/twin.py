@@ -50,11 +50,11 @@ def parameter_names(arm: SerialArm) -> tuple[str, ...]:
     """Return the names of all parameters of an arm and its camera."""
     gears = [f"gear_{name}" for name in arm.joint_names]
     zeros = [f"zero_{name}" for name in arm.joint_names]
-    links = [name for name, _, _ in _links(arm)]
+    links = [name for name, _, _ in links_of(arm)]
     return (*TIMES, *CAMERA, *TOOL, *LENS, *gears, *zeros, *links)
 
 
-def _links(arm: SerialArm) -> Iterator[tuple[str, int, int]]:
+def links_of(arm: SerialArm) -> Iterator[tuple[str, int, int]]:
     """Yield the name of each length of an arm with its row and axis among the translations."""
     for row, axis in np.argwhere(np.abs(arm.translation) > MIN_LENGTH).tolist():
         yield f"link_{row}_{'xyz'[axis]}", row, axis
@@ -68,7 +68,7 @@ def deviated(model: RobotModel, values: Mapping[str, float]) -> RobotModel:
 
     planned = model.arm
     translation = planned.translation.copy()
-    for name, row, axis in _links(planned):
+    for name, row, axis in links_of(planned):
         translation[row, axis] *= 1.0 + values.get(name, 0.0)
     zeros = given(*(f"zero_{name}" for name in planned.joint_names))
     gears = given(*(f"gear_{name}" for name in planned.joint_names))
@@ -98,7 +98,7 @@ def ball_rates(
     # The i-th translation is along the axes of the frame before it, those of the first along the base's.
     axes = np.insert(frames[..., :3, :3], 0, np.eye(3), axis=1)
     rates = {}
-    for name, row, axis in _links(arm):
+    for name, row, axis in links_of(arm):
         rates[name] = model.arm.translation[row, axis] * axes[:, row, :, axis]
     for axis, name in enumerate(TOOL):
         rates[name] = axes[:, -1, :, axis]

@@ -81,6 +81,11 @@ def _model(
         raise ConfigurationError(
             f"{name} cannot be exported: it is not composed of an estimator and a law"
         )
+    if controller.servo.calibration is not None:
+        remedy = "take aids.model=regression"
+        raise ConfigurationError(
+            f"{name} cannot be exported while it fits the arm (aids.model=arm): {remedy}"
+        )
     if not controller.servo.initial.immediate:
         remedy = "set initial.source to nominal or given"
         raise ConfigurationError(

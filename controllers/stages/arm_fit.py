@@ -1,0 +1,400 @@
+"""Self-calibration: the parameters of the nominal arm and its camera, fitted to the frames of the run while it servoes.
+
+    y_k = h(q(t_k − L); θ, ω) + ν_k,        ν_k ~ N(0, σ² I + s² ẏ_k ẏ_kᵀ) with outliers
+
+with the features h of a serial arm (`FeatureModel`: tool, gears, zeros, links, pose of the camera), the latency L of a
+frame, the rate ω at which the camera turns about its optical axis, and the deviation s of the frames' unknown lateness,
+which moves a feature along its motion. An ensemble of Levenberg-Marquardt fits, which begin at different arms,
+minimises
+
+    Σ_k c ln(1 + ‖r_k‖²/c) + Σ_i 2 ln(1 + (θ_i/a_i)²) + 3 − tr(R₀ᵀR) + (L − L₀)²/2σ_L² + ω²/2σ_ω²
+
+over whitened residuals r_k, with Student's loss for outliers and Cauchy priors, of which small deviations shrink and
+large ones cost little. Members count by exp(−cost/2).
+
+Each step makes one iteration, so that the work of a step does not depend on a clock. Frames are kept in a buffer of
+`FRAMES`: the last ones, and of older ones a set that is thinned evenly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple, TypeAlias, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.features import FeatureModel
+from servobench.plant.contract.lanes import branch, pick
+from servobench.plant.contract.signals import BoolArray
+
+IntArray: TypeAlias = npt.NDArray[np.int_]
+
+FRAMES: Final = 96  # frames in the buffer
+RECENT: Final = 36  # the last of them, which are not thinned
+LONGEST: Final = 0.55  # [s] longest latency that is considered
+GRID: Final = (
+    0.05  # [s] between joint positions that are kept beside a frame, and a period at least
+)
+# Sizes of random deviations at which members begin, in four classes
+SPREADS: Final = {
+    "zero": (0.05, 0.4, 1.0, 2.5),  # [rad]
+    "gear": (0.01, 0.1, 0.3, 0.4),  # [1]
+    "tool": (0.01, 0.05, 0.15, 0.2),  # [m]
+    "target": (0.01, 0.05, 0.15, 0.2),  # [m]
+    "link": (0.03, 0.05, 0.15, 0.3),  # [1]
+}
+CORES: Final = {"zero": 0.08, "gear": 0.02, "tool": 0.02, "target": 0.02, "link": 0.04}
+"""a_i, cores of the Cauchy priors, in the same units."""
+LARGEST: Final = {"gear": 0.7, "link": 0.8}  # [1] largest deviations of a member
+LATENCY: Final = (0.1, 0.3)  # [s] L₀ and σ_L
+LATENCIES: Final = (-0.3, LONGEST - 0.05)  # [s] between which it lies
+TURNING: Final = 0.05  # [rad/s] σ_ω
+STUDENT: Final = 8.0  # c [1]
+PLACE: Final = 1.0  # [m] prior deviation of the camera's place
+FLOOR: Final = 0.3e-3  # [m] least σ, in natural units
+FIRST_DAMPING: Final = 1e-2  # [1] λ
+MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
+ROWS: Final = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
+
+
+class Frames(NamedTuple):
+    """The frames that are fitted, the oldest first."""
+
+    time: FloatArray  # (..., F) [s] since the start
+    feature: FloatArray  # (..., F, m)
+    weight: FloatArray  # (..., F, m), 1 for a valid feature, 0 for none
+    path: FloatArray  # (..., F, J, n) [rad], joint positions up to the frame, `GRID` apart, the newest last
+    number: IntArray  # (...), how many there are
+
+
+class Members(NamedTuple):
+    """The ensemble of fits; E members."""
+
+    theta: FloatArray  # θ, (..., E, P)
+    cameras: FloatArray  # (..., E, c, 4, 4)
+    latency: FloatArray  # L, (..., E) [s]
+    turning: FloatArray  # ω, (..., E) [rad/s]
+    damping: FloatArray  # λ of Levenberg and Marquardt, (..., E)
+    cost: FloatArray  # (..., E)
+
+
+class Fitted(NamedTuple):
+    """Residuals of members with their derivatives."""
+
+    residual: FloatArray  # y − h, (..., E, F, m)
+    rates: FloatArray  # ∂h by θ, L and ω, (..., E, F, m, P + 2)
+    motion: FloatArray  # ẏ, (..., E, F, m), 1/s
+
+
+def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatArray, FloatArray]:
+    """Return joint positions and velocities a delay before each frame, by Catmull-Rom splines.
+
+    Args:
+        path: (..., F, J, n) [rad].
+        delay: (..., E) [s].
+        grid: [s] between rows.
+
+    Returns:
+        (..., E, F, n) [rad], and [rad/s].
+    """
+    last = path.shape[-2] - 1
+    x = np.clip(last - delay / grid, 0.0, last)
+    first = np.minimum(x.astype(np.int_), last - 1)
+    u = (x - first)[..., None, None]
+    rows = []
+    for shift in (-1, 0, 1, 2):
+        index = np.clip(first + shift, 0, last)
+        row = np.take_along_axis(path[..., None, :, :, :], index[..., None, None, None], axis=-2)
+        rows.append(row[..., 0, :])
+    before, begin, end, after = rows
+    slope_begin = 0.5 * (end - before)
+    slope_end = 0.5 * (after - begin)
+    # At the ends of the path the slope is that of the last interval.
+    ends = (first + 2 > last)[..., None, None]
+    begins = (first == 0)[..., None, None]
+    slope_end = np.where(ends, end - begin, slope_end)
+    slope_begin = np.where(begins, end - begin, slope_begin)
+    cubic = 2.0 * begin - 2.0 * end + slope_begin + slope_end
+    square = 3.0 * (end - begin) - 2.0 * slope_begin - slope_end
+    chord = (cubic * u + square) * u + slope_begin
+    slope = (3.0 * cubic * u + 2.0 * square) * u + slope_begin
+    return begin + chord * u, slope / grid
+
+
+def each_row(frames: Frames, function: Callable[[FloatArray], FloatArray]) -> Frames:
+    """Return the buffer with a function applied to its arrays of rows."""
+    rows: dict[str, Any] = {name: function(getattr(frames, name)) for name in ROWS}
+    return frames._replace(**rows)
+
+
+def _thinned(frames: Frames) -> Frames:
+    """Return a full buffer without the old frame whose neighbours are nearest to each other in time."""
+    old = frames.time[..., : FRAMES - RECENT]
+    gaps = old[..., 2:] - old[..., :-2]
+    dropped = 1 + gaps.argmin(axis=-1)
+    rows = np.arange(FRAMES)
+    behind = rows >= dropped[..., None]
+    kept = np.minimum(rows + behind, FRAMES - 1)
+    thinned = each_row(frames, lambda array: pick(array, kept, axes=1))
+    return thinned._replace(number=frames.number - 1)
+
+
+def added(
+    frames: Frames, time: FloatArray, feature: FloatArray, valid: BoolArray, path: FloatArray
+) -> Frames:
+    """Return the buffer with one more frame, given `path` (..., J, n)."""
+    frames = branch(frames.number == FRAMES, _thinned, frames)
+    here = np.arange(FRAMES) == frames.number[..., None]
+    new = {"time": time, "feature": feature, "weight": valid.astype(np.float64), "path": path}
+    rows: dict[str, Any] = {}
+    for name in ROWS:
+        old: FloatArray = getattr(frames, name)
+        mask = here.reshape(here.shape + (1,) * (old.ndim - here.ndim))
+        value = np.expand_dims(new[name], here.ndim - 1)
+        rows[name] = np.where(mask, value, old)
+    return frames._replace(**rows, number=frames.number + 1)
+
+
+def first(frames: Frames, most: int) -> Frames:
+    """Return the buffer with `most` rows at most, a number that does not depend on other lanes."""
+    axis = frames.time.ndim - 1
+    kept = range(min(most, FRAMES))
+    return each_row(frames, lambda array: array.take(kept, axis=axis))
+
+
+def whitened(
+    fitted: Fitted, lateness: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals and their derivatives in units in which noise of Σ = σ² I + s² ẏẏᵀ has the deviation σ.
+
+    Args:
+        fitted: of members.
+        lateness: s, (...) [s].
+        variance: σ², (..., E).
+    """
+    motion = fitted.motion
+    square = np.vecdot(motion, motion)
+    unit = motion / np.sqrt(np.maximum(square, 1e-12))[..., None]
+    late = np.square(lateness)[..., None, None]
+    excess = late * square / variance[..., None]
+    share = 1.0 - 1.0 / np.sqrt(1.0 + excess)
+    along = share * np.vecdot(unit, fitted.residual)
+    residual = fitted.residual - along[..., None] * unit
+    slopes = share[..., None] * np.vecmat(unit, fitted.rates)
+    rates = fitted.rates - unit[..., None] * slopes[..., None, :]
+    return residual, rates
+
+
+@final
+class Fit:
+    """The fits of the members to the frames of a buffer."""
+
+    def __init__(self, model: FeatureModel, scale: float, period: float) -> None:
+        """Take the model, its unit in those of the frames' features, and the control period [s]."""
+        self.model = model
+        self.scale = scale
+        self.stride = max(1, round(GRID / period))
+        self.grid = self.stride * period
+        self.rows = 1 + int(np.ceil(LONGEST / self.grid))
+        names = model.names
+        self.count = len(names)
+        self._cores = np.full(len(names), np.inf)
+        self._largest = np.full(len(names), np.inf)
+        self._spreads = np.zeros((4, len(names)))
+        for index, name in enumerate(names):
+            kind = name.partition("_")[0]
+            self._cores[index] = CORES.get(kind, np.inf)
+            self._largest[index] = LARGEST.get(kind, np.inf)
+            self._spreads[:, index] = SPREADS.get(kind, (0.0,) * 4)
+        self._turns = [index for index, name in enumerate(names) if "turn_" in name]
+        places = range(model.pose_columns.start, len(names))
+        self._places = [index for index in places if index not in self._turns]
+        self._zeros = model.columns("zero_")
+        self.first_turn = names.index("camera_turn_z")
+        # Cauchy deviates of members, the same in every run.
+        draw = np.random.default_rng(12345).uniform(-1.0, 1.0, (256, len(names)))
+        self._draws = draw
+        _, self._planned = model.start(())
+
+    def start(self, lead: tuple[int, ...], count: int, latency: FloatArray) -> Members:
+        """Return members that begin at different arms, the first one at the nominal one."""
+        members = self.spawned(lead, np.zeros(lead, dtype=np.int_), count, latency)
+        members.theta[..., 0, :] = 0.0
+        return members
+
+    def spawned(
+        self, lead: tuple[int, ...], first: IntArray, count: int, latency: FloatArray
+    ) -> Members:
+        """Return new members, by the rows of the table of draws from `first` (...) on."""
+        each = np.arange(count)
+        rows = (first[..., None] + each) % len(self._draws)
+        classes = each % len(self._spreads)
+        planned = self._planned
+        size = (*lead, count)
+        late = np.asarray(latency)[..., None]
+        return Members(
+            theta=self._draws[rows] * self._spreads[classes],
+            cameras=np.broadcast_to(planned, (*size, *planned.shape)),
+            latency=np.repeat(late, count, axis=-1),
+            turning=np.zeros(size),
+            damping=np.full(size, FIRST_DAMPING),
+            cost=np.full(size, np.inf),
+        )
+
+    def aligned(self, members: Members, frames: Frames) -> Members:
+        """Return members whose cameras are placed where their arms fit the frames best, where that has a solution."""
+        q, _ = at_latency(frames.path, members.latency, self.grid)
+        weight = np.minimum.reduce(frames.weight, axis=-1)[..., None, :]
+        features = self.scale * frames.feature[..., None, :, :]
+        cameras = self.model.placed(members.theta, members.cameras, q, features, weight)
+        return members._replace(cameras=cameras)
+
+    def fitted(self, members: Members, frames: Frames) -> Fitted:
+        """Return the residuals of members at the frames, with derivatives."""
+        q, v = at_latency(frames.path, members.latency, self.grid)
+        since = frames.time[..., None, :]
+        turn = members.turning[..., None] * since
+        found = self.model.derivatives(members.theta, members.cameras, q, turn)
+        weight = frames.weight[..., None, :, :]
+        motion = np.matvec(found.by_joint, v)
+        by_turning = found.by_parameter[..., self.first_turn] * since[..., None]
+        rates = np.concatenate(
+            [found.by_parameter, -motion[..., None], by_turning[..., None]], axis=-1
+        )
+        residual = frames.feature[..., None, :, :] - found.feature / self.scale
+        return Fitted(
+            residual=weight * residual,
+            rates=weight[..., None] * rates / self.scale,
+            motion=weight * motion / self.scale,
+        )
+
+    def residual(self, members: Members, frames: Frames) -> FloatArray:
+        """Return y − h of members at the frames, (..., E, F, m)."""
+        q, _ = at_latency(frames.path, members.latency, self.grid)
+        turn = members.turning[..., None] * frames.time[..., None, :]
+        seen = self.model.feature(members.theta, members.cameras, q, turn)
+        residual = frames.feature[..., None, :, :] - seen / self.scale
+        return frames.weight[..., None, :, :] * residual
+
+    def costs(
+        self, members: Members, fitted: Fitted, lateness: FloatArray, variance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the cost of members, (..., E), and ‖r_k‖²/σ² of their frames, (..., E, F)."""
+        bare = fitted._replace(rates=np.zeros((*fitted.rates.shape[:-1], 0)))
+        residual, _ = whitened(bare, lateness, variance)
+        square = np.vecdot(residual, residual) / variance[..., None]
+        data = STUDENT * np.log1p(square / STUDENT)
+        cost = np.add.reduce(data, axis=-1) + self._prior_cost(members)
+        return cost, square
+
+    def _prior_cost(self, members: Members) -> FloatArray:
+        relative = members.theta / self._cores
+        cost = np.add.reduce(2.0 * np.log1p(relative * relative), axis=-1)
+        offset = (members.latency - LATENCY[0]) / LATENCY[1]
+        cost = cost + 0.5 * offset * offset
+        cost = cost + 0.5 * np.square(members.turning / TURNING)
+        planned = self._planned
+        R = members.cameras[..., :3, :3]
+        product = planned[..., :3, :3] * R
+        entries = product.reshape(*R.shape[:-2], 9)
+        turned = 3.0 - np.add.reduce(entries, axis=-1)
+        place = members.cameras[..., :3, 3]
+        away = (place - planned[..., :3, 3]) / PLACE
+        poses = turned + 0.5 * np.vecdot(away, away)
+        return np.asarray(cost + np.add.reduce(poses, axis=-1))
+
+    def _prior_slope(self, members: Members) -> tuple[FloatArray, FloatArray]:
+        """Return the prior's information, (..., E, P + 2), and its pull on each parameter."""
+        theta = members.theta
+        bounded = np.isfinite(self._cores)
+        own = np.where(bounded, 2.0 / (self._cores**2 + theta * theta), 0.0)
+        pull = -own * theta
+
+        planned = self._planned
+        place = members.cameras[..., :3, 3]
+        away = place - planned[..., :3, 3]
+        information = 0.5 / PLACE**2
+        own[..., self._places] = information
+        every = (*place.shape[:-2], -1)
+        pull[..., self._places] = -information * away.reshape(every)
+
+        # ½ ∂(3 − tr(R₀ᵀ R exp([δ]×)))/∂δ
+        R = members.cameras[..., :3, :3]
+        A = np.swapaxes(planned[..., :3, :3], -1, -2) @ R
+        odd = A - np.swapaxes(A, -1, -2)
+        slope = 0.5 * odd[..., (1, 2, 0), (2, 0, 1)]
+        own[..., self._turns] = 1.0
+        pull[..., self._turns] = slope.reshape(every)
+
+        weights = 0.5 / np.square([LATENCY[1], TURNING])
+        further = np.broadcast_to(weights, (*theta.shape[:-1], 2))
+        offsets = np.stack([members.latency - LATENCY[0], members.turning], axis=-1)
+        whole = np.concatenate([own, further], axis=-1)
+        return whole, np.concatenate([pull, -further * offsets], axis=-1)
+
+    def iterated(
+        self,
+        members: Members,
+        frames: Frames,
+        fitted: Fitted,
+        lateness: FloatArray,
+        variance: FloatArray,
+    ) -> tuple[Members, FloatArray]:
+        """Return members after an iteration, with their residuals; a step that raises the cost is not made.
+
+        The motions of the features, along which frames are late, are those before the step.
+        """
+        residual, rates = whitened(fitted, lateness, variance)
+        cost, square = self.costs(members, fitted, lateness, variance)
+        weight = 1.0 / (1.0 + square / STUDENT) / variance[..., None]
+        # Frames and features are one axis of the products.
+        tall = (*rates.shape[:-3], -1)
+        D = rates.reshape(*tall, rates.shape[-1])
+        w = np.repeat(weight, rates.shape[-2], axis=-1)
+        weighted = D * w[..., None]
+        information, pull = self._prior_slope(members)
+        H = np.swapaxes(weighted, -1, -2) @ D
+        g = np.vecmat(residual.reshape(tall), weighted) + pull
+        diagonal = np.diagonal(H, axis1=-2, axis2=-1) + information
+        identity = np.eye(H.shape[-1])
+        damped = information + members.damping[..., None] * diagonal
+        A = H + damped[..., None] * identity
+        step = np.linalg.solve(A, g[..., None])[..., 0]
+        step = step * self._shrink(step)[..., None]
+        tried = self._moved(members, step)
+        found = self.residual(tried, frames)
+        tried_cost, _ = self.costs(tried, fitted._replace(residual=found), lateness, variance)
+        better = tried_cost < cost
+        damping = np.where(better, 0.2 * members.damping, 8.0 * members.damping)
+        new = Members(*(_chosen(better, a, b) for a, b in zip(tried, members, strict=True)))
+        new = new._replace(
+            damping=np.clip(damping, 1e-6, 1e4), cost=np.where(better, tried_cost, cost)
+        )
+        return new, _chosen(better, found, fitted.residual)
+
+    def _shrink(self, step: FloatArray) -> FloatArray:
+        """Return the share of a step (..., P + 2) that moves no zero too far."""
+        zeros = np.abs(step[..., self._zeros])
+        largest = np.maximum.reduce(zeros, axis=-1)
+        return np.asarray(np.minimum(1.0, MAX_ZERO_STEP / np.maximum(largest, 1e-9)))
+
+    def _moved(self, members: Members, step: FloatArray) -> Members:
+        """Return members after a step (..., E, P + 2), within bounds."""
+        own = step[..., : self.count]
+        later, turning = np.moveaxis(step[..., self.count :], -1, 0)
+        theta, cameras = self.model.moved(members.theta, members.cameras, own)
+        latency = members.latency + later
+        return members._replace(
+            theta=np.clip(theta, -self._largest, self._largest),
+            cameras=cameras,
+            latency=np.clip(latency, *LATENCIES),
+            turning=members.turning + turning,
+        )
+
+
+def _chosen(better: BoolArray, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the arrays (..., E, *) of one where it is better, and of the other elsewhere."""
+    mask = better.reshape(better.shape + (1,) * (one.ndim - better.ndim))
+    return np.where(mask, one, other)

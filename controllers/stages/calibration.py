@@ -1,0 +1,501 @@
+"""The calibrating stage: an arm that is fitted while it servoes (`arm_fit`), and whether to believe it.
+
+The arm and the regression predict each frame from what was known `HORIZON` frames before. The fitted arm is used while
+the mean square of its errors is below a multiple (`GATE`) of that of the regression: a small one while there are few
+frames, which fit any arm, a larger one once it explains all frames to their noise.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple, final
+
+import numpy as np
+
+from servobench.controllers.choice import choose
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.stages.arm_fit import (
+    FLOOR,
+    FRAMES,
+    Fit,
+    Fitted,
+    Frames,
+    IntArray,
+    Members,
+    added,
+    at_latency,
+    first,
+    whitened,
+)
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.features import FeatureModel
+from servobench.plant.contract.lanes import branch, norm, pick
+from servobench.plant.contract.signals import BoolArray, Observation
+
+MANY: Final = 24  # members at first
+FEWER: Final = ((0.6, 8), (3.0, 4))  # [s] and members from then on
+FIRST_ITERATIONS: Final = 6
+MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
+NOISE: Final = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
+BIAS_TIME: Final = 0.4  # [s] over which the residuals' mean is taken
+HORIZON: Final = 5  # frames
+MEMORY: Final = 0.9  # [1] share of the errors that is kept from frame to frame
+MAX_ERROR: Final = 12.0  # [1] largest error that counts, in σ
+GATE: Final = 1.1  # [1]
+HYSTERESIS: Final = (0.8, 1.25)  # [1] factors of the gate before and while the arm is used
+FEW_FRAMES: Final = 25
+MANY_FRAMES: Final = 40
+FEW_GATE: Final = 0.6  # [1] factor of the gate with few frames
+KNOWN_GATE: Final = 2.0  # [1] factor of the gate where all frames are explained
+MIN_TRAVEL: Final = 2.0  # [rad] motion of all joints before it is
+EXPLAINED: Final = 1.3  # [1] residuals in σ up to which frames are explained
+LEAST_LATENESS: Final = 0.012  # [s] below which there is none
+FAST: Final = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
+UNEXPLAINED: Final = 1.6  # [1] residuals in σ from which on new members are tried
+LAST_TRIAL: Final = 12.0  # [s]
+MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
+MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
+TRIAL_TIME: Final = 0.25  # [s] from one trial to the next
+
+
+class Known(NamedTuple):
+    """What was known at a frame, with which later ones are predicted."""
+
+    members: Members
+    share: FloatArray  # weight of each member, (..., E)
+    bias: FloatArray  # (..., E, m)
+    feature: FloatArray  # the regression's, without its noise, (..., m)
+    jacobian: FloatArray  # the regression's, (..., m, n)
+    exposed: (
+        FloatArray  # joint position at the frame's exposure, by the regression's delay, (..., n)
+    )
+    fitted: BoolArray  # (...), whether the members had been fitted
+
+
+class CalibrationState(NamedTuple):
+    """The state of the stage."""
+
+    begin: float  # [s] time of the first observation
+    history: FloatArray  # joint positions of the last periods, the newest first, (..., h, n)
+    frames: Frames
+    members: Members
+    share: FloatArray  # weight of each member, (..., E)
+    bias: FloatArray  # mean residual of each member, (..., E, m)
+    fitted: BoolArray  # (...), whether anything was fitted
+    lateness: FloatArray  # s, (...) [s]
+    across: FloatArray  # deviation of residuals across the motion, (...); 0 where it is unknown
+    rms: FloatArray  # deviation of the residuals of the best member, (...)
+    noise: FloatArray  # σ of the last frame, (...)
+    travel: FloatArray  # (...) [rad] sum of the joints' motion
+    errors: FloatArray  # mean squares of the prediction errors of regression and arm, (..., 2); NaN before
+    used: BoolArray  # (...), whether the arm is believed
+    spawned: IntArray  # members begun so far, (...)
+    tried: FloatArray  # [s] time of the last trial of new members, (...)
+    past: tuple[Known, ...]  # the last `HORIZON` frames, the oldest first
+
+
+class Ahead(NamedTuple):
+    """Prediction by the fitted arm."""
+
+    feature: FloatArray  # (..., m)
+    jacobian: FloatArray  # (..., m, n)
+    drift: FloatArray  # motion of the feature in a period by the camera's turning, (..., m)
+
+
+@final
+class Calibration:
+    """The stage; see above."""
+
+    def __init__(self, knowledge: RobotKnowledge, model: FeatureModel) -> None:
+        """Take knowledge in natural units, and the model in the unit of the plant."""
+        self._period = knowledge.spec.period
+        self._m = knowledge.spec.m
+        self.fit = Fit(model, knowledge.unit, self._period)
+
+    def start(self, observation: Observation) -> CalibrationState:
+        """Return the state before any frame."""
+        lead = observation.feature.shape[:-1]
+        q = observation.joint_position
+        fit = self.fit
+        m = self._m
+        n = q.shape[-1]
+        none = np.zeros(lead)[()]
+        no = np.zeros(lead, dtype=np.bool_)[()]
+        zero = np.zeros(lead, dtype=np.int_)[()]
+        rows = (*lead, FRAMES)
+        features = np.zeros((*rows, m))
+        paths = np.zeros((*rows, fit.rows, n))
+        frames = Frames(np.zeros(rows), features, features, paths, number=zero)
+        members = fit.spawned(lead, zero, MANY, none)
+        size = (*lead, MANY)
+        periods = 1 + (fit.rows - 1) * fit.stride
+        history = np.broadcast_to(q[..., None, :], (*lead, periods, n))
+        return CalibrationState(
+            begin=float(observation.time),
+            history=history.copy(),
+            frames=frames,
+            members=members,
+            share=np.full(size, 1.0 / MANY),
+            bias=np.zeros((*size, m)),
+            fitted=no,
+            lateness=none,
+            across=none,
+            rms=none,
+            noise=none,
+            travel=none,
+            errors=np.full((*lead, 2), np.nan),
+            used=no,
+            spawned=zero + MANY,
+            tried=none,
+            past=(),
+        )
+
+    def update(
+        self,
+        state: CalibrationState,
+        observation: Observation,
+        due: BoolArray,
+        regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    ) -> CalibrationState:
+        """Return the state at an observation.
+
+        Args:
+            state: one period ago.
+            observation: of this period.
+            due: whether its frame is learned from, (...).
+            regression: its feature without noise (..., m), Jacobian (..., m, n), delay (...) [s] and noise σ (...).
+        """
+        q = observation.joint_position
+        step = q - state.history[..., 0, :]
+        earlier = state.history[..., :-1, :]
+        history = np.concatenate([q[..., None, :], earlier], axis=-2)
+        state = state._replace(history=history, travel=state.travel + norm(step))
+        elapsed = float(observation.time) - state.begin
+        for begin, size in FEWER:
+            if elapsed > begin and state.share.shape[-1] > size:
+                state = self._reduced(state, size)
+        past = state.past
+        state = branch(
+            due, self._learn, state._replace(past=()), observation, regression, past, elapsed
+        )
+        return state._replace(past=self._remembered(past, state, due, regression))
+
+    def _learn(
+        self,
+        state: CalibrationState,
+        observation: Observation,
+        regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        past: tuple[Known, ...],
+        elapsed: float,
+    ) -> CalibrationState:
+        """Return the state after a frame."""
+        fit = self.fit
+        _, _, delay, deviation = regression
+        path = state.history[..., :: fit.stride, :][..., ::-1, :]
+        lead = state.travel.shape
+        time = np.full(lead, elapsed)[()]
+        y = observation.feature
+        frames = added(state.frames, time, y, observation.valid, path)
+        noise = np.clip(deviation, *NOISE)
+        known = (state.lateness > 0.0) & (state.across > 0.0)
+        across = np.minimum(np.maximum(state.across, NOISE[0]), noise)
+        noise = np.where(known, across, noise)
+        state = state._replace(frames=frames, noise=noise)
+        if past:
+            state = self._judged(state, y, path, elapsed, delay, past)
+        many = frames.number >= MANY_FRAMES
+        level = np.where(
+            many & state.fitted, np.minimum(noise, EXPLAINED * state.rms + 0.2e-3), noise
+        )
+
+        moved = norm(y - frames.feature[..., 0, :]) > MIN_MOTION * noise
+        begins = ~state.fitted & moved & (frames.number > 2)
+        state = branch(begins, self._begun, state, elapsed, delay, level)
+        state = branch(state.fitted, self._continued, state, elapsed, level)
+        used = self._trusted(state)
+        lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
+        new = lost & (time - state.tried > TRIAL_TIME) & (time < LAST_TRIAL)
+        return branch(new, self._tried, state._replace(used=used), elapsed, delay, time)
+
+    def _in_use(self, state: CalibrationState, elapsed: float) -> Frames:
+        """Return the frames, without rows for which there were too few periods so far."""
+        return first(state.frames, 1 + round(elapsed / self._period))
+
+    def _begun(
+        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
+    ) -> CalibrationState:
+        """Return the state with members fitted for the first time."""
+        fit = self.fit
+        frames = self._in_use(state, elapsed)
+        lead = state.travel.shape
+        members = fit.start(lead, state.share.shape[-1], delay)
+        members = fit.aligned(members, frames)
+        floor = np.square(FLOOR) + np.square(noise)[..., None]
+        fitted = fit.fitted(members, frames)
+        square = np.vecdot(fitted.residual, fitted.residual)
+        wide = np.maximum(floor, np.median(square, axis=-1) / 3.0)
+        for left in range(FIRST_ITERATIONS):
+            # The noise is taken for larger at first, so that wrong arms find their way.
+            variance = np.maximum(floor, wide * 0.25**left)
+            if left == FIRST_ITERATIONS - 1:
+                variance = np.broadcast_to(floor, wide.shape)
+            fitted = fit.fitted(members, frames)
+            members, _ = fit.iterated(members, frames, fitted, state.lateness, variance)
+        return state._replace(members=members, fitted=np.ones_like(state.fitted))
+
+    def _continued(
+        self, state: CalibrationState, elapsed: float, noise: FloatArray
+    ) -> CalibrationState:
+        """Return the state after an iteration, with weights, biases and the noise of frames that members imply."""
+        fit = self.fit
+        frames = self._in_use(state, elapsed)
+        floor = np.square(FLOOR) + np.square(noise)[..., None]
+        variance = np.broadcast_to(floor, state.share.shape)
+        fitted = fit.fitted(state.members, frames)
+        members, residual = fit.iterated(state.members, frames, fitted, state.lateness, variance)
+        fitted = fitted._replace(residual=residual)
+        cost = members.cost
+        state = state._replace(members=members)
+        best = cost.argmin(axis=-1)
+        excess = cost - np.minimum.reduce(cost, axis=-1)[..., None]
+        likelihood = np.exp(np.maximum(-0.5 * excess, MIN_EXPONENT))
+        share = likelihood / np.add.reduce(likelihood, axis=-1)[..., None]
+        state = state._replace(members=state.members._replace(cost=cost), share=share)
+        residual, _ = whitened(
+            fitted._replace(rates=fitted.rates[..., :0]), state.lateness, variance
+        )
+        there = np.maximum.reduce(frames.weight, axis=-1) > 0.0
+        square = np.vecdot(residual, residual)
+        own = pick(square, best)
+        rms = np.sqrt(_median_of(own, there) / 2.366)
+        bias = self._bias(
+            residual, square, frames, elapsed, np.minimum(noise, 1.5 * rms + 0.2e-3), noise
+        )
+        state = state._replace(rms=rms, bias=bias)
+        return self._lateness(state, fitted, best, there)
+
+    def _bias(
+        self,
+        residual: FloatArray,
+        square: FloatArray,
+        frames: Frames,
+        elapsed: float,
+        level: FloatArray,
+        noise: FloatArray,
+    ) -> FloatArray:
+        """Return the mean residual of members, (..., E, m), shrunk to 0 where noise explains it."""
+        past = np.maximum((frames.time - elapsed) / BIAS_TIME, MIN_EXPONENT)
+        age = np.exp(past) * frames.weight[..., 0]
+        inlier = square < 30.0 * np.square(level)[..., None, None]
+        weight = age[..., None, :] * inlier + 1e-9
+        total = np.add.reduce(weight, axis=-1)
+        count = total * total / np.add.reduce(weight * weight, axis=-1)
+        mean = np.vecmat(weight, residual) / total[..., None]
+        expected = 3.0 * np.square(np.maximum(noise, 1e-4))[..., None] / count
+        significance = np.vecdot(mean, mean) / expected
+        kept = np.clip(1.0 - 2.0 / np.maximum(significance, 1e-9), 0.0, 1.0)
+        return np.asarray(mean * kept[..., None])
+
+    def _lateness(
+        self, state: CalibrationState, fitted: Fitted, best: IntArray, there: BoolArray
+    ) -> CalibrationState:
+        """Return the state with the lateness of frames by the spread of residuals along their motion."""
+        residual = pick(fitted.residual, best)
+        motion = pick(fitted.motion, best)
+        speed = norm(motion)
+        fast = (speed > FAST) & there
+        unit = motion / np.maximum(speed, 1e-9)[..., None]
+        along = np.vecdot(unit, residual)
+        aside = residual - along[..., None] * unit
+        side = np.vecdot(aside, aside)
+        enough = np.add.reduce(fast, axis=-1) > 12
+        across = _median_of(side, fast) / 1.386
+        fine = fast & (side < 12.0 * across[..., None])
+        square = np.maximum(speed * speed, FAST**2)
+        ratio = (along * along - across[..., None]) / square
+        middle = np.maximum(_median_of(ratio, fine), 0.0)
+        capped = np.minimum(ratio, 8.0 * middle[..., None]) * fine
+        number = np.maximum(np.add.reduce(fine, axis=-1), 1)
+        mean = np.add.reduce(capped, axis=-1) / number
+        lateness = np.sqrt(np.maximum(mean, 0.0))
+        lateness = np.where(lateness > LEAST_LATENESS, lateness, 0.0)
+        return state._replace(
+            lateness=np.where(enough, lateness, state.lateness),
+            across=np.where(enough, np.sqrt(across), state.across),
+        )
+
+    def _judged(
+        self,
+        state: CalibrationState,
+        y: FloatArray,
+        path: FloatArray,
+        elapsed: float,
+        delay: FloatArray,
+        past: tuple[Known, ...],
+    ) -> CalibrationState:
+        """Return the state with the errors of both in predicting a frame from what was known some frames ago."""
+        known = past[0]
+        fit = self.fit
+        members = known.members
+        q, _ = at_latency(path[..., None, :, :], members.latency, fit.grid)
+        turn = (members.turning * elapsed)[..., None]
+        found = fit.model.feature(members.theta, members.cameras, q, turn)
+        seen = found[..., 0, :] / fit.scale
+        by_arm = np.vecmat(known.share, seen + known.bias)
+        exposed, _ = at_latency(path[..., None, :, :], delay[..., None], fit.grid)
+        moved = np.matvec(known.jacobian, exposed[..., 0, 0, :] - known.exposed)
+        by_regression = known.feature + moved
+        errors = np.stack([y - by_regression, y - by_arm], axis=-2)
+        most = np.square(MAX_ERROR * state.noise)[..., None]
+        squares = np.minimum(np.vecdot(errors, errors), most)
+        mean = MEMORY * state.errors + (1.0 - MEMORY) * squares
+        mean = np.where(np.isnan(state.errors), squares, mean)
+        return state._replace(errors=np.where(known.fitted[..., None], mean, state.errors))
+
+    def _trusted(self, state: CalibrationState) -> BoolArray:
+        gate = GATE * np.where(state.used, HYSTERESIS[1], HYSTERESIS[0])
+        count = state.frames.number
+        explained = (
+            (count >= MANY_FRAMES)
+            & (state.travel > MIN_TRAVEL)
+            & (state.rms < EXPLAINED * state.noise)
+        )
+        gate = np.where(explained, KNOWN_GATE * gate, gate)
+        gate = np.where(count < FEW_FRAMES, FEW_GATE * gate, gate)
+        better = state.errors[..., 1] < gate * state.errors[..., 0]
+        return np.asarray(state.fitted & better)
+
+    def _tried(
+        self, state: CalibrationState, elapsed: float, delay: FloatArray, time: FloatArray
+    ) -> CalibrationState:
+        """Return the state with new members in place of the worse half."""
+        fit = self.fit
+        size = state.share.shape[-1]
+        count = size // 2
+        order = np.argsort(state.members.cost, axis=-1)
+        kept = order[..., : size - count]
+        new = fit.spawned(state.travel.shape, state.spawned, count, delay)
+        new = fit.aligned(new, self._in_use(state, elapsed))
+
+        def joined(old: FloatArray, fresh: FloatArray) -> FloatArray:
+            return np.concatenate([pick(old, kept, axes=1), fresh], axis=len(state.travel.shape))
+
+        members = Members(*(joined(*each) for each in zip(state.members, new, strict=True)))
+        nothing = np.zeros((*state.travel.shape, count))
+        share = np.concatenate([pick(state.share, kept, axes=1), nothing], axis=-1)
+        total = np.add.reduce(share, axis=-1)[..., None]
+        bias = joined(state.bias, np.zeros((*nothing.shape, self._m)))
+        return state._replace(
+            members=members,
+            share=share / np.maximum(total, 1e-12),
+            bias=bias,
+            spawned=state.spawned + count,
+            tried=time,
+        )
+
+    def _reduced(self, state: CalibrationState, size: int) -> CalibrationState:
+        """Return the state with the best members alone, as many as `size`."""
+        finite = np.isfinite(state.members.cost)
+        cost = np.where(finite, state.members.cost, np.finfo(np.float64).max)
+        kept = np.argsort(cost, axis=-1)[..., :size]
+        members, share, bias = _of(kept, state.members, state.share, state.bias)
+        return state._replace(members=members, share=share, bias=bias)
+
+    def _remembered(
+        self,
+        past: tuple[Known, ...],
+        state: CalibrationState,
+        due: BoolArray,
+        regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    ) -> tuple[Known, ...]:
+        """Return what is known at the last frames, with this one where it is due."""
+        feature, jacobian, delay, _ = regression
+        path = state.history[..., :: self.fit.stride, :][..., ::-1, :]
+        exposed, _ = at_latency(path[..., None, :, :], delay[..., None], self.fit.grid)
+        new = Known(
+            state.members,
+            state.share,
+            state.bias,
+            feature,
+            jacobian,
+            exposed[..., 0, 0, :],
+            state.fitted,
+        )
+        if not past:
+            return (new,) * HORIZON
+        if past[-1].share.shape != new.share.shape:
+            past = tuple(_trimmed(each, new.share.shape[-1]) for each in past)
+        return tuple(
+            choose(due, later, earlier)
+            for later, earlier in zip((*past[1:], new), past, strict=True)
+        )
+
+    def ahead(
+        self, state: CalibrationState, bound: FloatArray, lead: FloatArray, time: float
+    ) -> Ahead:
+        """Return the prediction for joints that are bound to reach `bound` (..., n) after `lead` (...) periods."""
+        fit = self.fit
+        members = state.members
+        size = state.share.shape[-1]
+        q = np.broadcast_to(
+            bound[..., None, None, :], (*bound.shape[:-1], size, 1, bound.shape[-1])
+        )
+        ahead = lead[..., None] * self._period
+        since = time - state.begin + ahead + members.latency
+        turn = (members.turning * since)[..., None]
+        found = fit.model.derivatives(members.theta, members.cameras, q, turn)
+        feature = found.feature[..., 0, :] / fit.scale
+        by_turn = found.by_parameter[..., 0, :, fit.first_turn] / fit.scale
+        drift = by_turn * (members.turning * self._period)[..., None]
+        jacobian = found.by_joint[..., 0, :, :] / fit.scale
+        flat = jacobian.reshape(*jacobian.shape[:-2], -1)
+        mean = np.vecmat(state.share, flat)
+        shape = (*bound.shape[:-1], *jacobian.shape[-2:])
+        return Ahead(
+            feature=np.vecmat(state.share, feature + state.bias),
+            jacobian=mean.reshape(shape),
+            drift=np.vecmat(state.share, drift),
+        )
+
+    def diagnostics(self, state: CalibrationState) -> Diagnostics:
+        """Return the stage's own numbers."""
+        members = state.members
+        latency = np.vecdot(state.share, members.latency)
+        turning = np.vecdot(state.share, members.turning)
+        errors = np.sqrt(state.errors)
+        return {
+            "calibrated": np.asarray(state.used, dtype=np.float64),
+            "calibration_rms": state.rms,
+            "calibration_latency": latency,
+            "calibration_turning": turning,
+            "lateness": state.lateness,
+            "regression_error": errors[..., 0],
+            "arm_error": errors[..., 1],
+        }
+
+
+def _of(
+    kept: IntArray, members: Members, share: FloatArray, bias: FloatArray
+) -> tuple[Members, FloatArray, FloatArray]:
+    """Return the members of indices `kept` (..., k), with their weights, which sum to 1, and biases."""
+    fewer = Members(*(pick(each, kept, axes=1) for each in members))
+    own = pick(share, kept, axes=1)
+    total = np.maximum(np.add.reduce(own, axis=-1), MIN_TOTAL)
+    return fewer, own / total[..., None], pick(bias, kept, axes=1)
+
+
+def _trimmed(known: Known, size: int) -> Known:
+    """Return what was known, with the best members alone."""
+    kept = np.argsort(-known.share, axis=-1)[..., :size]
+    members, share, bias = _of(kept, known.members, known.share, known.bias)
+    return known._replace(members=members, share=share, bias=bias)
+
+
+def _median_of(values: FloatArray, chosen: BoolArray) -> FloatArray:
+    """Return the median of the chosen values, (...), of (..., k); 0 where none is chosen."""
+    count = np.add.reduce(chosen, axis=-1)
+    ordered = np.sort(np.where(chosen, values, np.inf), axis=-1)
+    low = pick(ordered, np.maximum((count - 1) // 2, 0))
+    last = values.shape[-1] - 1
+    high = pick(ordered, np.minimum(count // 2, last))
+    high = np.where(np.isfinite(high), high, low)
+    return np.where(count > 0, 0.5 * (low + high), 0.0)

@@ -1,0 +1,135 @@
+"""The fit of an arm to frames: interpolation, whitening, slopes of the cost, and arms that are found again."""
+
+import numpy as np
+import pytest
+
+from servobench.controllers.stages.arm_fit import (
+    FRAMES,
+    RECENT,
+    Fit,
+    Fitted,
+    Frames,
+    added,
+    at_latency,
+    whitened,
+)
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.parametric import ParametricModel
+
+PERIOD = 0.05  # [s]
+LATENCY = 0.08  # [s] of the made-up runs
+NOISE = 1e-3  # [m]
+TRUE = {"gear_elbow": 0.2, "zero_shoulder_pan": 0.4, "zero_wrist_1": -0.2, "tool_x": 0.02}
+
+
+def fit_of_ur5():
+    return Fit(ParametricModel(find_robot("ur5").nominal), 1.0, PERIOD)
+
+
+def joints_at(time):
+    """Return joint positions (..., 6) that move all joints in different ways."""
+    home = np.asarray(find_robot("ur5").workspace.home)
+    pace = 1.0 + 0.35 * np.arange(6)
+    phase = np.arange(6)
+    return home + 0.25 * (np.sin(pace * time[..., None] + phase) - np.sin(phase))
+
+
+def empty(fit, m=3, n=6):
+    return Frames(
+        time=np.zeros(FRAMES),
+        feature=np.zeros((FRAMES, m)),
+        weight=np.zeros((FRAMES, m)),
+        path=np.zeros((FRAMES, fit.rows, n)),
+        number=np.int_(0),
+    )
+
+
+def made_up(fit, seconds=4.0, deviations=TRUE):
+    """Return frames of an arm with deviations, and its θ and cameras."""
+    generator = np.random.default_rng(1)
+    model = fit.model
+    step = np.zeros(len(model.names))
+    for name, value in deviations.items():
+        step[[each.startswith(name) for each in model.names]] = value
+    theta, cameras = model.moved(*model.start(()), step)
+    frames = empty(fit)
+    back = fit.grid * np.arange(fit.rows)[::-1]
+    for time in np.arange(0.0, seconds, PERIOD):
+        exposed = joints_at(np.array([time - LATENCY]))
+        y = model.feature(theta, cameras, exposed)[0] + NOISE * generator.standard_normal(3)
+        path = joints_at(time - back)
+        frames = added(frames, np.float64(time), y, np.ones(3, dtype=bool), path)
+    return frames, theta, cameras
+
+
+def test_joints_between_rows_are_those_of_a_smooth_motion():
+    back = 0.05 * np.arange(12)[::-1]
+    path = joints_at(3.0 - back)
+    delay = np.array([0.0, 0.02, 0.13, 0.4])
+    position, velocity = at_latency(path[None], delay, 0.05)
+    step = 1e-5
+    times = 3.0 - delay
+    rates = (joints_at(times + step) - joints_at(times - step)) / (2.0 * step)
+    np.testing.assert_allclose(position[2:, 0], joints_at(times[2:]), atol=1e-5)
+    # Nothing is known beyond the last row.
+    np.testing.assert_allclose(position[:2, 0], joints_at(times[:2]), atol=5e-4)
+    np.testing.assert_allclose(velocity[1:, 0], rates[1:], atol=0.02)
+
+
+def test_a_full_buffer_keeps_the_last_frames_and_thins_the_others_evenly():
+    fit = fit_of_ur5()
+    frames = empty(fit)
+    count = 1000
+    for k in range(count):
+        feature = np.full(3, float(k))
+        frames = added(frames, np.float64(k), feature, np.ones(3, bool), np.zeros((fit.rows, 6)))
+    assert frames.number == FRAMES
+    np.testing.assert_array_equal(frames.time[-RECENT:], np.arange(count - RECENT, count))
+    assert frames.time[0] == 0.0
+    gaps = np.diff(frames.time[: FRAMES - RECENT])
+    assert gaps.max() <= 3.0 * np.median(gaps)
+    np.testing.assert_array_equal(frames.feature[:, 0], frames.time)
+
+
+def test_whitening_makes_noise_along_the_motion_white():
+    motion = np.array([[[0.3, 0.4, 0.0]]])
+    lateness, deviation = 0.02, 0.001
+    covariance = deviation**2 * np.eye(3) + lateness**2 * np.outer(motion[0, 0], motion[0, 0])
+    residuals = np.eye(3)
+    fitted = Fitted(
+        residual=residuals[None], rates=np.zeros((1, 3, 3, 0)), motion=np.repeat(motion, 3, axis=1)
+    )
+    white, _ = whitened(fitted, np.float64(lateness), np.array([deviation**2]))
+    squares = np.vecdot(white[0], white[0]) / deviation**2
+    np.testing.assert_allclose(squares, np.diag(np.linalg.inv(covariance)), rtol=1e-9)
+
+
+def test_an_iteration_steps_downhill_by_the_slope_of_the_cost():
+    fit = fit_of_ur5()
+    frames, _, _ = made_up(fit, 1.0)
+    members = fit.spawned((), np.int_(0), 4, np.float64(0.05))
+    variance = np.full(4, 1e-4)
+    late = np.float64(0.0)
+    before = fit.costs(members, fit.fitted(members, frames), late, variance)[0]
+    after, residual = fit.iterated(members, frames, fit.fitted(members, frames), late, variance)
+    assert (after.cost <= before).all()
+    assert (after.cost < before).any()
+    np.testing.assert_allclose(residual, fit.residual(after, frames), atol=1e-12)
+
+
+def test_a_deviating_arm_is_found_again_at_all_places_and_so_is_the_latency():
+    fit = fit_of_ur5()
+    frames, theta, cameras = made_up(fit, 6.0)
+    members = fit.aligned(fit.start((), 8, np.float64(0.1)), frames)
+    variance = np.full(8, NOISE**2)
+    for _ in range(40):
+        fitted = fit.fitted(members, frames)
+        members, _ = fit.iterated(members, frames, fitted, np.float64(0.0), variance)
+    best = int(members.cost.argmin())
+    assert members.latency[best] == pytest.approx(LATENCY, abs=2e-3)
+    elsewhere = joints_at(np.linspace(20.0, 60.0, 50))
+    wanted = fit.model.derivatives(theta, cameras, elsewhere)
+    found = fit.model.derivatives(members.theta[best], members.cameras[best], elsewhere)
+    wrong = np.linalg.norm(found.by_joint - wanted.by_joint) / np.linalg.norm(wanted.by_joint)
+    assert wrong < 0.03
+    assert np.abs(found.feature - wanted.feature).max() < 0.02
