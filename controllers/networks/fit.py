@@ -128,13 +128,14 @@ def controller_samples(
     m = spec.m
     count = len(unit)
     q = lower + (upper - lower) * unit[:, :n]
+    # Not of length 1: uniform in the cube
     direction = 2.0 * unit[:, n : n + m] - 1.0
     magnitude = unit[:, n + m : n + m + 1]
     error = plan.error_range * magnitude * direction
 
     # `back` is the way from each older joint position of the histories to q(k−1).
-    symmetric = 2.0 * unit[:, n + m + 1 :].reshape(count, -1, n) - 1.0
-    steps = symmetric * (spec.joint_velocity_limit * plan.step)
+    signed_shares = 2.0 * unit[:, n + m + 1 :].reshape(count, -1, n) - 1.0
+    steps = signed_shares * (spec.joint_velocity_limit * plan.step)
     back = np.concatenate([np.zeros((count, 1, n)), np.cumsum(steps, axis=1)], axis=1)
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
@@ -143,8 +144,8 @@ def controller_samples(
     pinv = damped_inverse(J, plan.damping)
     if plan.damping == 0.0:
         pinv = np.asarray(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), dtype=np.float64)
-    away = (lower + upper)[None, :] / 2.0 - q
-    free = away - (pinv @ (J @ away[..., None]))[..., 0]
+    to_middle = (lower + upper)[None, :] / 2.0 - q
+    free = to_middle - (pinv @ (J @ to_middle[..., None]))[..., 0]
     # The matrix ψ of the fit of its entries has none for a constant, which the posture would need.
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0
     gain = plan.gain * plan.step * pinv

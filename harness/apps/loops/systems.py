@@ -249,7 +249,7 @@ class LoopResponse:
         S = sensitivity(L)
         one = np.eye(S.shape[-1])
         T = one - S
-        mean = S - one / 2.0  # (S − T)/2
+        half_difference = S - one / 2.0  # (S − T)/2
         return Margins(
             gain_margin=_least(gain[gain >= 1.0]),
             gain_reduction_margin=_greatest(gain[gain < 1.0]),
@@ -258,7 +258,7 @@ class LoopResponse:
             crossover_rad_s=_greatest(where),
             sensitivity_peak=_peak(S),
             complementary_peak=_peak(T),
-            disk_margin=1.0 / _peak(mean),
+            disk_margin=1.0 / _peak(half_difference),
         )
 
     def delay_margin(self) -> float:

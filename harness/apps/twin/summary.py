@@ -120,8 +120,9 @@ def _drive_lines(log: Log, response: Response | None) -> list[str]:
 
 def _longer_line(log: Log, robot: Identified) -> str:
     """Return how much longer a log would halve the widest interval of a parameter, in deviations of its prior."""
-    told = [name for name, own in zip(robot.names, robot.told, strict=True) if own]
-    shares = [(robot.estimate(n)[1] / prior(n), n) for n in told if n not in EXTRAS]
+    identified = [name for name, is_told in zip(robot.names, robot.told, strict=True) if is_told]
+    wanted = [name for name in identified if name not in EXTRAS]
+    shares = [(robot.estimate(name)[1] / prior(name), name) for name in wanted]
     share, widest = max(shares)
     # Half the interval needs four times the information, of which the prior is no part.
     longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)
