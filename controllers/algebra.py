@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from servobench.plant.contract import lanes
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import branch, plus_diagonal
@@ -20,18 +21,9 @@ def nearest_rotation(M: FloatArray) -> FloatArray:
         FilterDiverged: an M has no singular value decomposition.
     """
     try:
-        left, _, right = np.linalg.svd(M)
+        return lanes.nearest_rotation(M)
     except np.linalg.LinAlgError as error:
         raise FilterDiverged(f"map has no nearest rotation: {M.tolist()}") from error
-    R = left @ right
-    return branch(np.linalg.det(R) < 0.0, _reflected, R, left, right)
-
-
-def _reflected(R: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the product with the sign of the smallest singular value changed, so that the determinant is 1."""
-    signs = np.ones(R.shape[-1])
-    signs[-1] = -1.0
-    return np.asarray((left * signs) @ right)
 
 
 def damped_inverse(J: FloatArray, damping: float) -> FloatArray:

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import FeatureModel
-from servobench.plant.contract.lanes import branch, pick
+from servobench.plant.contract.lanes import branch, pick, plus_diagonal, where
 from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
@@ -55,6 +55,11 @@ STUDENT: Final = 8.0  # c [1]
 PLACE: Final = 1.0  # [m] prior deviation of the camera's place
 FLOOR: Final = 0.3e-3  # [m] least σ, in natural units
 FIRST_DAMPING: Final = 1e-2  # [1] λ
+DAMPING_FACTORS: Final = (
+    0.2,
+    8.0,
+)  # [1] changes of λ after a step that is made, and one that is not
+DAMPINGS: Final = (1e-6, 1e4)  # [1] between which λ lies
 MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
 ROWS: Final = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
 
@@ -213,9 +218,9 @@ class Fit:
         self._places = [index for index in places if index not in self._turns]
         self._zeros = model.columns("zero_")
         self.first_turn = names.index("camera_turn_z")
-        # Cauchy deviates of members, the same in every run.
-        draw = np.random.default_rng(12345).uniform(-1.0, 1.0, (256, len(names)))
-        self._draws = draw
+        # Where members begin, in shares of their spreads; the same in every run.
+        generator = np.random.default_rng(12345)
+        self._draws = generator.uniform(-1.0, 1.0, (256, len(names)))
         _, self._planned = model.start(())
 
     def start(self, lead: tuple[int, ...], count: int, latency: FloatArray) -> Members:
@@ -358,21 +363,20 @@ class Fit:
         H = np.swapaxes(weighted, -1, -2) @ D
         g = np.vecmat(residual.reshape(tall), weighted) + pull
         diagonal = np.diagonal(H, axis1=-2, axis2=-1) + information
-        identity = np.eye(H.shape[-1])
         damped = information + members.damping[..., None] * diagonal
-        A = H + damped[..., None] * identity
+        A = plus_diagonal(H, damped)
         step = np.linalg.solve(A, g[..., None])[..., 0]
         step = step * self._shrink(step)[..., None]
         tried = self._moved(members, step)
         found = self.residual(tried, frames)
         tried_cost, _ = self.costs(tried, fitted._replace(residual=found), lateness, variance)
         better = tried_cost < cost
-        damping = np.where(better, 0.2 * members.damping, 8.0 * members.damping)
-        new = Members(*(_chosen(better, a, b) for a, b in zip(tried, members, strict=True)))
+        damping = members.damping * np.where(better, *DAMPING_FACTORS)
+        new = Members(*(where(better, a, b) for a, b in zip(tried, members, strict=True)))
         new = new._replace(
-            damping=np.clip(damping, 1e-6, 1e4), cost=np.where(better, tried_cost, cost)
+            damping=np.clip(damping, *DAMPINGS), cost=np.where(better, tried_cost, cost)
         )
-        return new, _chosen(better, found, fitted.residual)
+        return new, where(better, found, fitted.residual)
 
     def _shrink(self, step: FloatArray) -> FloatArray:
         """Return the share of a step (..., P + 2) that moves no zero too far."""
@@ -392,9 +396,3 @@ class Fit:
             latency=np.clip(latency, *LATENCIES),
             turning=members.turning + turning,
         )
-
-
-def _chosen(better: BoolArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the arrays (..., E, *) of one where it is better, and of the other elsewhere."""
-    mask = better.reshape(better.shape + (1,) * (one.ndim - better.ndim))
-    return np.where(mask, one, other)

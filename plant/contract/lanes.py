@@ -151,6 +151,24 @@ def outer(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("...i,...j->...ij", a, b))  # a third faster than a product of views
 
 
+def nearest_rotation(M: FloatArray) -> FloatArray:
+    """Return the rotation R, (..., m, m), nearest to M, (..., m, m), in the Frobenius norm: it maximises trace(RᵀM).
+
+    Raises:
+        LinAlgError: an M has no singular value decomposition.
+    """
+    left, _, right = np.linalg.svd(M)
+    R = left @ right
+    return branch(np.linalg.det(R) < 0.0, _reflected, R, left, right)
+
+
+def _reflected(R: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the product with the sign of the smallest singular value changed, so that the determinant is 1."""
+    signs = np.ones(R.shape[-1])
+    signs[-1] = -1.0
+    return np.asarray((left * signs) @ right)
+
+
 def norm(x: FloatArray) -> FloatArray:
     """Return ‖x‖, (...), for x (..., n)."""
     length: FloatArray = np.sqrt(np.vecdot(x, x))

@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import Derivatives
+from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.twin import TOOL, links_of
@@ -287,14 +288,6 @@ def turned(cameras: FloatArray, turn: FloatArray | None) -> FloatArray:
     first = side_by_side[..., 0, :3, :3]
     new[..., 0, :3, :3] = first @ about_z(turn)
     return new
-
-
-def nearest_rotation(A: FloatArray) -> FloatArray:
-    """Return the rotations R (..., 3, 3) with the largest tr(Rᵀ A)."""
-    U, _, V = np.linalg.svd(A)
-    mirrored = np.linalg.det(U @ V) < 0.0
-    U[..., 2] = np.where(mirrored[..., None], -U[..., 2], U[..., 2])
-    return np.asarray(U @ V)
 
 
 def skew(v: FloatArray) -> FloatArray:
