@@ -133,7 +133,16 @@ class Servo:
 
     def jacobian(self, state: ServoState) -> FloatArray:
         """Return Ĵ of the last step, (..., m, n), in the unit of the plant per rad; NaN before."""
-        return np.asarray(self._unit * state.jacobian)
+        J = state.jacobian
+        if state.calibration is not None:
+            J = branch(state.calibration.used, self._arm_jacobian, J, state.calibration)
+        return np.asarray(self._unit * J)
+
+    def _arm_jacobian(self, _: FloatArray, calibration: CalibrationState) -> FloatArray:
+        """Return the Jacobian of the calibrated arm, (..., m, n), in lanes where it is believed."""
+        if self.calibration is None:
+            raise ValueError("aids: there is no calibrating stage")
+        return self.calibration.jacobian(calibration)
 
     def _natural(self, observation: Observation) -> Observation:
         return observation.with_values(observation.joint_position, observation.feature / self._unit)
@@ -194,7 +203,6 @@ class Servo:
                     calibration,
                     ahead.joint_position,
                     lead,
-                    observation.time,
                 )
                 ahead = ahead.with_values(ahead.joint_position, seen.feature)
                 J = seen.jacobian
@@ -245,12 +253,11 @@ class Servo:
         calibration: CalibrationState,
         bound: FloatArray,
         lead: FloatArray,
-        time: float,
     ) -> Ahead:
         """Return the prediction of the calibrated arm in lanes where it is believed."""
         if self.calibration is None:
             raise ValueError("aids: there is no calibrating stage")
-        return self.calibration.ahead(calibration, bound, lead, time)
+        return self.calibration.ahead(calibration, bound, lead)
 
     def _command(
         self,

@@ -32,7 +32,8 @@ from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
 MANY: Final = 24  # members at first
-FEWER: Final = ((0.6, 8), (3.0, 4))  # [s] and members from then on
+FEWER: Final = ((0.6, 8), (2.0, 3))  # [s] and members from then on
+INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
 FIRST_ITERATIONS: Final = 6
 MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
 NOISE: Final = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
@@ -40,7 +41,7 @@ BIAS_TIME: Final = 0.4  # [s] over which the residuals' mean is taken
 HORIZON: Final = 5  # frames
 MEMORY: Final = 0.9  # [1] share of the errors that is kept from frame to frame
 MAX_ERROR: Final = 12.0  # [1] largest error that counts, in σ
-GATE: Final = 1.1  # [1]
+GATE: Final = 0.9  # [1] below 1: errors of both are limited, so that two bad predictions are equal
 HYSTERESIS: Final = (0.8, 1.25)  # [1] factors of the gate before and while the arm is used
 FEW_FRAMES: Final = 25
 MANY_FRAMES: Final = 40
@@ -51,7 +52,7 @@ EXPLAINED: Final = 1.3  # [1] residuals in σ up to which frames are explained
 LEAST_LATENESS: Final = 0.012  # [s] below which there is none
 FAST: Final = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
 UNEXPLAINED: Final = 1.6  # [1] residuals in σ from which on new members are tried
-LAST_TRIAL: Final = 12.0  # [s]
+LAST_TRIAL: Final = 30.0  # [s]
 MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
 TRIAL_TIME: Final = 0.25  # [s] from one trial to the next
@@ -75,6 +76,7 @@ class CalibrationState(NamedTuple):
     """The state of the stage."""
 
     begin: float  # [s] time of the first observation
+    elapsed: float  # [s] from it to the last one
     history: FloatArray  # joint positions of the last periods, the newest first, (..., h, n)
     frames: Frames
     members: Members
@@ -88,6 +90,7 @@ class CalibrationState(NamedTuple):
     travel: FloatArray  # (...) [rad] sum of the joints' motion
     errors: FloatArray  # mean squares of the prediction errors of regression and arm, (..., 2); NaN before
     used: BoolArray  # (...), whether the arm is believed
+    passed: IntArray  # frames since the last iteration, (...)
     spawned: IntArray  # members begun so far, (...)
     tried: FloatArray  # [s] time of the last trial of new members, (...)
     past: tuple[Known, ...]  # the last `HORIZON` frames, the oldest first
@@ -131,6 +134,7 @@ class Calibration:
         history = np.broadcast_to(q[..., None, :], (*lead, periods, n))
         return CalibrationState(
             begin=float(observation.time),
+            elapsed=0.0,
             history=history.copy(),
             frames=frames,
             members=members,
@@ -144,6 +148,7 @@ class Calibration:
             travel=none,
             errors=np.full((*lead, 2), np.nan),
             used=no,
+            passed=zero,
             spawned=zero + MANY,
             tried=none,
             past=(),
@@ -168,8 +173,9 @@ class Calibration:
         step = q - state.history[..., 0, :]
         earlier = state.history[..., :-1, :]
         history = np.concatenate([q[..., None, :], earlier], axis=-2)
-        state = state._replace(history=history, travel=state.travel + norm(step))
         elapsed = float(observation.time) - state.begin
+        travel = state.travel + norm(step)
+        state = state._replace(history=history, travel=travel, elapsed=elapsed)
         for begin, size in FEWER:
             if elapsed > begin and state.share.shape[-1] > size:
                 state = self._reduced(state, size)
@@ -210,11 +216,14 @@ class Calibration:
         moved = norm(y - frames.feature[..., 0, :]) > MIN_MOTION * noise
         begins = ~state.fitted & moved & (frames.number > 2)
         state = branch(begins, self._begun, state, elapsed, delay, level)
-        state = branch(state.fitted, self._continued, state, elapsed, level)
+        state = state._replace(passed=state.passed + 1)
+        explained = many & (state.rms < EXPLAINED * noise)
+        iterates = state.fitted & (~explained | (state.passed >= INTERVAL))
+        state = branch(iterates, self._continued, state, elapsed, level)
         used = self._trusted(state)
         lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
         new = lost & (time - state.tried > TRIAL_TIME) & (time < LAST_TRIAL)
-        return branch(new, self._tried, state._replace(used=used), elapsed, delay, time)
+        return branch(new, self._tried, state._replace(used=used), elapsed, delay, level)
 
     def _in_use(self, state: CalibrationState, elapsed: float) -> Frames:
         """Return the frames, without rows for which there were too few periods so far."""
@@ -228,19 +237,26 @@ class Calibration:
         frames = self._in_use(state, elapsed)
         lead = state.travel.shape
         members = fit.start(lead, state.share.shape[-1], delay)
+        members = self._annealed(members, frames, state.lateness, noise)
+        return state._replace(members=members, fitted=np.ones_like(state.fitted))
+
+    def _annealed(
+        self, members: Members, frames: Frames, lateness: FloatArray, noise: FloatArray
+    ) -> Members:
+        """Return new members after their first iterations, which take noise for larger: wrong arms find their way."""
+        fit = self.fit
         members = fit.aligned(members, frames)
         floor = np.square(FLOOR) + np.square(noise)[..., None]
-        fitted = fit.fitted(members, frames)
-        square = np.vecdot(fitted.residual, fitted.residual)
+        residual = fit.residual(members, frames)
+        square = np.vecdot(residual, residual)
         wide = np.maximum(floor, np.median(square, axis=-1) / 3.0)
         for left in range(FIRST_ITERATIONS):
-            # The noise is taken for larger at first, so that wrong arms find their way.
             variance = np.maximum(floor, wide * 0.25**left)
             if left == FIRST_ITERATIONS - 1:
                 variance = np.broadcast_to(floor, wide.shape)
             fitted = fit.fitted(members, frames)
-            members, _ = fit.iterated(members, frames, fitted, state.lateness, variance)
-        return state._replace(members=members, fitted=np.ones_like(state.fitted))
+            members, _ = fit.iterated(members, frames, fitted, lateness, variance)
+        return members
 
     def _continued(
         self, state: CalibrationState, elapsed: float, noise: FloatArray
@@ -270,7 +286,8 @@ class Calibration:
         bias = self._bias(
             residual, square, frames, elapsed, np.minimum(noise, 1.5 * rms + 0.2e-3), noise
         )
-        state = state._replace(rms=rms, bias=bias)
+        passed = np.zeros_like(state.passed)
+        state = state._replace(rms=rms, bias=bias, passed=passed)
         return self._lateness(state, fitted, best, there)
 
     def _bias(
@@ -365,7 +382,7 @@ class Calibration:
         return np.asarray(state.fitted & better)
 
     def _tried(
-        self, state: CalibrationState, elapsed: float, delay: FloatArray, time: FloatArray
+        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
         """Return the state with new members in place of the worse half."""
         fit = self.fit
@@ -374,7 +391,7 @@ class Calibration:
         order = np.argsort(state.members.cost, axis=-1)
         kept = order[..., : size - count]
         new = fit.spawned(state.travel.shape, state.spawned, count, delay)
-        new = fit.aligned(new, self._in_use(state, elapsed))
+        new = self._annealed(new, self._in_use(state, elapsed), state.lateness, noise)
 
         def joined(old: FloatArray, fresh: FloatArray) -> FloatArray:
             return np.concatenate([pick(old, kept, axes=1), fresh], axis=len(state.travel.shape))
@@ -389,7 +406,7 @@ class Calibration:
             share=share / np.maximum(total, 1e-12),
             bias=bias,
             spawned=state.spawned + count,
-            tried=time,
+            tried=np.full_like(state.tried, elapsed)[()],
         )
 
     def _reduced(self, state: CalibrationState, size: int) -> CalibrationState:
@@ -429,9 +446,12 @@ class Calibration:
             for later, earlier in zip((*past[1:], new), past, strict=True)
         )
 
-    def ahead(
-        self, state: CalibrationState, bound: FloatArray, lead: FloatArray, time: float
-    ) -> Ahead:
+    def jacobian(self, state: CalibrationState) -> FloatArray:
+        """Return the Jacobian at the joint position of the last observation, (..., m, n)."""
+        q = state.history[..., 0, :]
+        return self.ahead(state, q, np.zeros(q.shape[:-1])).jacobian
+
+    def ahead(self, state: CalibrationState, bound: FloatArray, lead: FloatArray) -> Ahead:
         """Return the prediction for joints that are bound to reach `bound` (..., n) after `lead` (...) periods."""
         fit = self.fit
         members = state.members
@@ -440,7 +460,7 @@ class Calibration:
             bound[..., None, None, :], (*bound.shape[:-1], size, 1, bound.shape[-1])
         )
         ahead = lead[..., None] * self._period
-        since = time - state.begin + ahead + members.latency
+        since = state.elapsed + ahead + members.latency
         turn = (members.turning * since)[..., None]
         found = fit.model.derivatives(members.theta, members.cameras, q, turn)
         feature = found.feature[..., 0, :] / fit.scale

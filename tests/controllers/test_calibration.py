@@ -83,3 +83,11 @@ def test_an_export_is_refused_by_name():
     request = RunRequest("kinematic", METHOD, "target", Mismatch.parse("none"), 0)
     with pytest.raises(ConfigurationError, match=r"fits the arm \(aids.model=arm\)"):
         controller_model(request, Settings(CALIBRATING))
+
+
+def test_the_jacobian_is_that_of_the_true_arm_after_a_part_of_a_lap():
+    short = {"circle": {"lap_time": 8.0, "laps": 1}, **CALIBRATING}
+    steps = carry_out(run(settings=short)).steps
+    assert steps["diagnostic_calibrated"].iloc[-1] == 1.0
+    # The regression alone is wrong by a quarter here.
+    assert steps["jacobian_error"].iloc[-1] < 0.02
