@@ -216,6 +216,11 @@ _ROWS = (
         "a regression on the nominal Jacobian, with model-free adaptive control",
         {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
+    Method(
+        "calibrating_mfac", "mfac", "constant",
+        "the nominal arm and camera, calibrated from the frames of the run, with model-free adaptive control",
+        {"gain": 27.7, "step_weight": 4.56e-3}, {**EQUIPPED, "model": "arm", "posture_gain": 0.167},
+    ),
     _both("ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)"),
     Method(
         "ukf_mpc", "mpc", "ukf", "unscented Kalman filter with model predictive control (eq. 46)",

@@ -1,5 +1,7 @@
 """The calibrating stage in closed loop: it learns wrong gears, is right elsewhere, and takes runs side by side."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 
@@ -13,23 +15,22 @@ from servobench.harness.run.episode import carry_out
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import override
 from servobench.plant.robot.mismatch import Mismatch
 
 pytestmark = pytest.mark.slow
-METHOD = "regression_mfac"
-CALIBRATING = {METHOD: {"aids": {"model": "arm"}}}
+METHOD = "calibrating_mfac"
+REGRESSING = {METHOD: {"aids": {"model": "regression"}}}
 FAR_GEARS = "moderate+gear_ratio=50%"
 
 
-def run(mismatch=FAR_GEARS, seed=3, *, settings=CALIBRATING, task="circle", **further):
+def run(mismatch=FAR_GEARS, seed=3, *, settings=MappingProxyType({}), task="circle", **further):
     request = RunRequest("kinematic", METHOD, task, Mismatch.parse(mismatch), seed, **further)
     return resolve(request, Settings(settings))
 
 
 def test_an_arm_with_far_gears_is_followed_more_closely_than_by_the_regression_alone():
     calibrated = carry_out(run())
-    regressed = carry_out(run(settings={}))
+    regressed = carry_out(run(settings=REGRESSING))
     assert calibrated.row["outcome"] == "followed"
     error = "rms_error_evaluated"
     assert calibrated.row[error] < 0.7 * regressed.row[error]
@@ -41,7 +42,6 @@ def test_the_latency_of_frames_is_found():
     late = {
         "kinematic": {"sensing": {"latency": 0.1}},
         "random": {"duration": 4.0},
-        **CALIBRATING,
     }
     steps = carry_out(run("moderate", settings=late, task="random")).steps
     assert steps["diagnostic_calibration_latency"].iloc[-1] == pytest.approx(0.1, abs=0.01)
@@ -51,7 +51,6 @@ def test_runs_side_by_side_have_the_bits_of_each_run_alone():
     rough = {
         "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}},
         "random": {"duration": 1.5},
-        **CALIBRATING,
     }
     runs = [run("severe", seed, settings=rough, task="random") for seed in (40001, 40002, 40003)]
     assert_rows_of_single_runs(runs)
@@ -59,21 +58,21 @@ def test_runs_side_by_side_have_the_bits_of_each_run_alone():
 
 @pytest.mark.parametrize("sensing", ["pixel", "stereo", "plate", "pixel:hand"])
 def test_it_servoes_under_every_sensing(sensing):
-    brief = {"exp2": {"duration": 3.0}, **CALIBRATING}
+    brief = {"exp2": {"duration": 3.0}}
     done = carry_out(run("moderate", settings=brief, task="exp2", sensing=sensing))
     assert done.row["status"] == "completed"
     assert np.isfinite(done.steps["diagnostic_calibration_rms"]).all()
 
 
 def test_another_arm_is_calibrated_as_well():
-    brief = {"exp2": {"duration": 3.0}, **CALIBRATING}
+    brief = {"exp2": {"duration": 3.0}}
     done = carry_out(run("moderate", settings=brief, task="exp2", robot="panda"))
     assert done.row["outcome"] == "settled"
 
 
 def test_an_arm_of_unknown_geometry_is_refused_with_the_reason():
     method = METHODS[METHOD]
-    config = override(METHOD, method.config(), CALIBRATING[METHOD])
+    config = method.config()
     knowledge = RobotKnowledge(plant_spec(6, 3), 4, lambda q: np.zeros((*q.shape[:-1], 3, 6)))
     with pytest.raises(ValueError, match="'arm' needs the geometry of the robot"):
         method.build(config, knowledge)
@@ -82,11 +81,11 @@ def test_an_arm_of_unknown_geometry_is_refused_with_the_reason():
 def test_an_export_is_refused_by_name():
     request = RunRequest("kinematic", METHOD, "target", Mismatch.parse("none"), 0)
     with pytest.raises(ConfigurationError, match=r"fits the arm \(aids.model=arm\)"):
-        controller_model(request, Settings(CALIBRATING))
+        controller_model(request, Settings())
 
 
-def test_the_jacobian_is_that_of_the_true_arm_after_a_part_of_a_lap():
-    short = {"circle": {"lap_time": 8.0, "laps": 1}, **CALIBRATING}
+def test_the_jacobian_is_that_of_the_true_arm_after_a_lap():
+    short = {"circle": {"lap_time": 8.0, "laps": 1}}
     steps = carry_out(run(settings=short)).steps
     assert steps["diagnostic_calibrated"].iloc[-1] == 1.0
     # The regression alone is wrong by a quarter here.

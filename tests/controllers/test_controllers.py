@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kit.nightly import NIGHTLY, some
-from kit.toy import KNOWLEDGE, networks, plant_spec, seen
+from kit.toy import KNOWLEDGE, SineModel, networks, plant_spec, seen
 from servobench.controllers import nmpc_calibrated
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial_jacobian import InitialConfig
@@ -62,6 +62,7 @@ def robot(n, m, seed):
         PREVIEW,
         nominal_jacobian,
         region=(np.full(n, -1.0), np.full(n, 1.0)),
+        nominal_model=SineModel(A, B),
         train=train_small,
         true_jacobian=lambda q: 1.1 * A * (B * np.cos(B * q))[..., None, :],
         true_symbolic=lambda q: casadi.mtimes(casadi.DM(1.1 * A), casadi.sin(casadi.DM(B) * q)),
@@ -162,6 +163,8 @@ def test_estimator_law_and_servo_report_different_things(entry):
         names += estimation.pairing.diagnostics(learned.pair)
     if servo.predictor is not None:
         names.append("lead")
+    if servo.calibration is not None:
+        names += servo.calibration.diagnostics(state.calibration)
     assert sorted(names) == sorted(merged)
 
 

@@ -19,6 +19,7 @@ from servobench.controllers.networks.config import (
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features
 from servobench.controllers.stages.finish import Finish
+from servobench.plant.contract.features import Derivatives
 from servobench.plant.contract.lanes import take
 from servobench.plant.contract.signals import Observation, PlantSpec
 
@@ -37,6 +38,49 @@ def plant_spec(n, m, speed=1.0, reach=6.0):
     return PlantSpec.of_joints(
         *names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), PERIOD
     )
+
+
+class SineModel:
+    """The parametric model of a made-up robot y = A sin(B ((1 + gear) q + zero)), whose camera changes nothing."""
+
+    def __init__(self, A, B):
+        self.A = A
+        self.B = B
+        self.n = len(B)
+        joints = range(self.n)
+        gears = [f"gear_j{i}" for i in joints]
+        zeros = [f"zero_j{i}" for i in joints]
+        pose = [f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z")]
+        self.names = (*gears, *zeros, *pose)
+        self.pose_columns = slice(2 * self.n, 2 * self.n + 6)
+
+    def columns(self, prefix):
+        found = [i for i, name in enumerate(self.names) if name.startswith(prefix)]
+        return slice(found[0], found[-1] + 1) if found else slice(0, 0)
+
+    def start(self, lead):
+        return np.zeros((*lead, len(self.names))), np.broadcast_to(np.eye(4), (*lead, 1, 4, 4))
+
+    def moved(self, theta, cameras, step):
+        theta = theta + step
+        theta[..., self.pose_columns] = 0.0
+        return theta, cameras
+
+    def feature(self, theta, cameras, joints, turn=None):
+        return self.derivatives(theta, cameras, joints).feature
+
+    def derivatives(self, theta, cameras, joints, turn=None):
+        gear = 1.0 + theta[..., None, : self.n]
+        angle = self.B * (gear * joints + theta[..., None, self.n : 2 * self.n])
+        slope = self.A * (self.B * np.cos(angle))[..., None, :]
+        pose = np.zeros((*slope.shape[:-1], 6))
+        by_parameter = np.concatenate([slope * joints[..., None, :], slope, pose], axis=-1)
+        return Derivatives(
+            np.matvec(self.A, np.sin(angle)), slope * gear[..., None, :], by_parameter
+        )
+
+    def placed(self, theta, cameras, joints, features, weight):
+        return cameras
 
 
 def seen(q, y, valid=True, k=0):

@@ -125,6 +125,7 @@ _CFDL: Final[Space] = {
 _MPC_AIDS: Final = {
     key: each for key, each in _AIDS.items() if key not in ("aids.feedforward", "aids.limit")
 }
+_ARM_AIDS: Final = {key: each for key, each in _AIDS.items() if key != "aids.model"}
 _MPC_SWITCHES: Final[Space] = {
     "law.mode": CategoricalDistribution(("constant", "moves")),
     "law.use_preview": _SWITCH,
@@ -141,6 +142,7 @@ SPACES: Final[Mapping[str, Space]] = {
     "rbfnn_mfac": {**_AIDS, **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
     "rbfnn_mfac:published": {**_RBFNN, **_RBF},
     "regression_mfac": {**_AIDS, **_MFAC},
+    "calibrating_mfac": {**_ARM_AIDS, **_MFAC},
     "ukf_mfac": {**_AIDS, **_START, **_MFAC, **_UKF},
     "ukf_mfac:published": {**_MFAC, **_UKF},
     "ukf_mpc": {**_MPC_AIDS, **_START, **_MPC_SWITCHES, **_MPC, **_UKF},
