@@ -287,7 +287,8 @@ SHARE_MARGIN: Final = 0.01  # [1]
 SECOND_LAP: Final = "rms_error_second_lap"
 POINT_TO_POINT: Final = "point_to_point"
 CURVE: Final = "curve"
-TASK_KINDS: Final = (POINT_TO_POINT, CURVE)
+SEQUENCE: Final = "sequence"
+TASK_KINDS: Final = (POINT_TO_POINT, CURVE, SEQUENCE)
 
 
 def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
@@ -336,12 +337,12 @@ def with_places(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the runs of the moves and those of the tracked curves.
+    """Return the runs of the moves, also of several in a row, and those of the tracked curves.
 
     A task of which no run could be built has no kind and is in neither.
     """
     kinds = texts_of(runs, "task_kind")
-    moves = runs.loc[kinds == POINT_TO_POINT, "task"].unique()
+    moves = runs.loc[kinds.isin((POINT_TO_POINT, SEQUENCE)), "task"].unique()
     curves = runs.loc[kinds == CURVE, "task"].unique()
     return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
 

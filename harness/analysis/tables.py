@@ -21,6 +21,7 @@ from servobench.harness.analysis.comparison import (
     MISSING,
     NO_ESTIMATE,
     POINT_TO_POINT,
+    SEQUENCE,
     Estimate,
     achieved_share,
     achievement,
@@ -233,6 +234,8 @@ def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
     lines = []
     if POINT_TO_POINT in kinds:
         lines.append(f"{SETTLED}: came within {settling_band(known)} and stayed")
+    if SEQUENCE in kinds:
+        lines.append(f"{SETTLED}: came within {settling_band(known)} and stayed in each move")
     if CURVE in kinds:
         label = METRICS["rms_error_evaluated"].label
         lines.append(f"{FOLLOWED}: {label} at most {settling_band(known, FOLLOWING_BANDS)}")
@@ -269,6 +272,8 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
         ["plant", "mismatch", "task"], sort=False
     ):
         kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
+        if (texts_of(place, "task_kind") == SEQUENCE).any():
+            kind = SEQUENCE
         summaries = [
             (column, metric.summary)
             for wanted in (kind, None)  # measures of such tasks first

@@ -34,6 +34,7 @@ FROM_STEPS: Final = (  # metrics that need neither limits of the plant nor times
     "controller_time_median_us", "controller_time_p99_us", "plant_time_median_us",
 )  # fmt: skip
 MOVE: Final = "point_to_point"
+SEQUENCE: Final = "sequence"
 MOVE_OUTCOMES: Final = frozenset(OUTCOMES) - {FOLLOWED, NOT_FOLLOWED}
 CURVE_OUTCOMES: Final = frozenset(OUTCOMES) - {SETTLED, NOT_SETTLED}
 ERRORS: Final = ("rms_error", "rms_error_evaluated", "rms_error_second_lap", "steady_state_error")
@@ -66,6 +67,9 @@ def _find_within(row: Mapping[str, Any], period: float) -> str:
     elif row["task_kind"] == MOVE:
         settled = not math.isnan(_number(row, "settling_time_s"))
         fits = outcome in MOVE_OUTCOMES and settled == (outcome == SETTLED)
+    elif row["task_kind"] == SEQUENCE:
+        first = not math.isnan(_number(row, "settling_time_first_s"))
+        fits = outcome in MOVE_OUTCOMES and (first or outcome != SETTLED)
     else:
         band = FOLLOWING_BANDS * _number(row, "settling_band")
         followed = _number(row, "rms_error_evaluated") <= band

@@ -142,7 +142,7 @@ def _judge(logged: Steps, experiment: Experiment) -> dict[str, FloatArray]:
     """Return the metrics of a run or of runs side by side; none without rows."""
     task = experiment.scenario
     if len(logged):
-        return judge_run(logged, task.kind, task.evaluate_from, task.lap_time)
+        return judge_run(logged, task.kind, task.evaluate_from, task.lap_time, task.moves)
     return {}
 
 

@@ -69,7 +69,9 @@ class Experiment:
         if moved:
             instant = int(run.camera_moves_at * self.periods)
             move = CameraMove(instant, self._in_lanes(moved))
-        return LoopSettings(self.periods, run.preview_rows, run.periods(run.lost_after), move)
+        jumps = tuple(math.ceil(each / run.period - 1e-9) for each in self.scenario.jumps)
+        lost_after = run.periods(run.lost_after)
+        return LoopSettings(self.periods, run.preview_rows, lost_after, move, jumps)
 
     def desired(self, periods: int | None = None) -> FloatArray:
         """Return the desired features of the run, or of this number of periods, and of the previewed rows beyond.

@@ -49,6 +49,7 @@ class LoopSettings:
         sys.maxsize
     )  # a run ends after so many periods in a row without a valid feature
     camera_move: CameraMove | None = None  # a move of the camera in the middle of the run, or None
+    jumps: tuple[int, ...] = ()  # periods in which the reference jumps, ascending
 
 
 @final
@@ -70,8 +71,15 @@ class Rollout:
 
     @property
     def reference(self) -> FloatArray:
-        """The reference from now on, (..., 1 + preview, m)."""
-        return self.desired[..., self.k : self.k + 1 + self.settings.preview, :]
+        """The reference from now on, (..., 1 + preview, m); a jump is not seen before it comes."""
+        rows = self.desired[..., self.k : self.k + 1 + self.settings.preview, :]
+        for jump in self.settings.jumps:
+            ahead = jump - self.k
+            if 0 < ahead <= self.settings.preview:
+                held = rows[..., ahead - 1 : ahead, :]
+                hidden = np.broadcast_to(held, rows[..., ahead:, :].shape)
+                return np.concatenate([rows[..., :ahead, :], hidden], axis=-2)
+        return rows
 
     def advance(self, command: Command) -> None:
         """Hold a command for a period.

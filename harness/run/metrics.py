@@ -6,7 +6,7 @@ report are made from the declarations. All errors are those of the true feature.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
+from servobench.harness.run.scenario import Span
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 
@@ -38,6 +39,7 @@ class Judged:
         error: of the true feature, (..., k) [unit of the feature].
         evaluated: the error in the evaluated part of the task, (..., j).
         second_lap: the error in the second lap of a curve that is repeated, (..., l).
+        move_times: settling times of the moves of a sequence, (..., s) [s].
         feature: the true one, (..., m, k).
         reference: (..., m, k).
         command: (..., n, k) [rad/s].
@@ -45,7 +47,14 @@ class Judged:
         jerk: of the commands, (..., n, k − 2) [rad/s³].
     """
 
-    def __init__(self, steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float) -> None:
+    def __init__(
+        self,
+        steps: Steps,
+        kind: TaskKind,
+        evaluate_from: float,
+        lap_time: float,
+        moves: Sequence[Span],
+    ) -> None:
         """Arrange the rows; see `judge_run`."""
         self.steps = steps
         self.fixed = kind == "point_to_point"
@@ -58,6 +67,7 @@ class Judged:
         judged_from, second, third = np.searchsorted(steps.time, begins - 1e-9)
         self.evaluated = self.error[..., judged_from:]
         self.second_lap = self.error[..., second:third]
+        self.move_times = move_times(steps, moves)
         # The step from rest to the first command does not count.
         self.acceleration = np.diff(self.command, axis=-1) / self.period
         self.jerk = np.diff(self.acceleration, axis=-1) / self.period
@@ -85,6 +95,7 @@ class Metric:
     meaning: str  # its definition
     # of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.outcome`.
     values: Callable[[Judged], FloatArray] | None = None
+    kind: TaskKind | None = None  # kind of the tasks that have it; None for all
     percent: bool = False  # whether it is shown in percent
     better: str = "less"  # `less`, or empty where neither direction is better
     # the tables of the report that show it, each with the group of columns: moves, curves, cost, runs
@@ -94,22 +105,30 @@ class Metric:
 
 
 def judge_run(
-    steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan
+    steps: Steps,
+    kind: TaskKind,
+    evaluate_from: float,
+    lap_time: float = math.nan,
+    moves: Sequence[Span] = (),
 ) -> dict[str, FloatArray]:
     """Return the metrics of a run, or of runs side by side.
 
     Args:
         steps: the rows, at least one.
-        kind: of the task; "point_to_point" has a fixed target.
+        kind: of the task; "point_to_point" has a fixed target, "sequence" several in a row.
         evaluate_from: where the evaluated part begins [s].
         lap_time: of a curve that is repeated [s]; NaN of any other.
+        moves: of a sequence.
 
     Returns:
-        Metric name -> (...); NaN where a metric does not apply, as the times of runs side by side.
+        Metric name -> (...), of those that such a task has; NaN where one does not apply, as the times of runs side by
+        side.
     """
-    run = Judged(steps, kind, evaluate_from, lap_time)
+    run = Judged(steps, kind, evaluate_from, lap_time, moves)
     return {
-        name: metric.values(run) for name, metric in METRICS.items() if metric.values is not None
+        name: metric.values(run)
+        for name, metric in METRICS.items()
+        if metric.values is not None and metric.kind in (None, kind)
     }
 
 
@@ -138,6 +157,26 @@ def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> Floa
         share = (band - after) / (before - after)
         crossing = first - np.where(first > 0, share, 0.0)
     return np.where(settled, crossing * period, np.nan)
+
+
+def move_times(steps: Steps, moves: Sequence[Span]) -> FloatArray:
+    """Return the settling times of moves in a row, each from its own first row on.
+
+    Args:
+        steps: the rows of a run, or of runs side by side.
+        moves: of the task.
+
+    Returns:
+        (..., s) [s]; NaN of a move that did not settle while its target was held, or that the run did not come to.
+    """
+    error = _columns(steps.error_norm())
+    times = np.full((*error.shape[:-1], len(moves)), np.nan)
+    for place, span in enumerate(moves):
+        first, behind = np.searchsorted(steps.time, np.array(span) - 1e-9)
+        if first < behind:
+            own = error[..., first:behind]
+            times[..., place] = settling_time(own, steps.spec.feature.band, steps.spec.period)
+    return times
 
 
 def log_error(error: FloatArray, band: float) -> FloatArray:
@@ -204,6 +243,14 @@ def _path_length_ratio(run: Judged) -> FloatArray:
         return np.where(way > 0.0, path_length(run.feature) / way, np.nan)
 
 
+def _median_time(run: Judged, moves: slice) -> FloatArray:
+    """Return the median settling time of moves of a sequence; NaN if one of them has none, or without such moves."""
+    times = run.move_times[..., moves]
+    if not times.shape[-1]:
+        return run.same(math.nan)
+    return np.asarray(np.median(times, axis=-1))
+
+
 def _saturation(run: Judged) -> FloatArray:
     limit = run.steps.spec.joint_velocity_limit[:, None] * (1 - 1e-9)
     at_limit = np.abs(run.command) >= limit
@@ -260,6 +307,22 @@ _ALL: Final = (
         "settling_time_5pct_s", "s", "settling time, 5 % band", 2,
         "the same with 5 % of e_0",
         lambda run: settling_time(run.error, SETTLING_SHARE * run.error[..., 0], run.period),
+    ),
+    Metric(
+        "settling_time_first_s", "s", "first move", 2,
+        "settling time of the first move of a sequence, such as `tour`, from its jump on, while its target is held",
+        lambda run: _median_time(run, slice(0, 1)), kind="sequence", summary=Summary(2, "sequence"),
+    ),
+    Metric(
+        "settling_time_second_s", "s", "second move", 2,
+        "likewise of the second move",
+        lambda run: _median_time(run, slice(1, 2)), kind="sequence", summary=Summary(2, "sequence"),
+    ),
+    Metric(
+        "settling_time_later_s", "s", "later moves", 2,
+        "median of those of the third and later moves; NaN if one of them did not settle",
+        lambda run: _median_time(run, slice(2, None)), kind="sequence",
+        tables={"moves": "Time"}, figure="settling", summary=Summary(2, "sequence"),
     ),
     Metric(
         "overshoot", "1", "overshoot", 1,

@@ -2,7 +2,7 @@
 
 | outcome | of | meaning |
 |---|---|---|
-| settled | moves | the run has a settling time: it came into the settling band and stayed there |
+| settled | moves | it has a settling time: it came into the settling band and stayed there; in a sequence each move |
 | not_settled | moves | it did not, for none of the reasons below |
 | followed | curves | the RMS error of the judged part is at most two settling bands, 10 mm on a UR5 |
 | not_followed | curves | it is larger, for none of the reasons below |
@@ -21,6 +21,7 @@ import numpy as np
 
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.log import Steps
+from servobench.harness.run.metrics import move_times
 from servobench.harness.run.references import ImageReference, Reference
 from servobench.harness.run.scenario import Scenario
 from servobench.plant.cameras.setups import SetupModel
@@ -58,9 +59,15 @@ def find_outcome(
         robot: the true arm with the camera as it is at the end of the run; None if only the plant knows it. Reach is
             checked only where the features are positions.
     """
-    move = scenario.kind == "point_to_point"
+    move = scenario.kind != "curve"
     band = (1.0 if move else FOLLOWING_BANDS) * steps.spec.feature.band
-    if not math.isnan(settling_time) if move else rms_error_evaluated <= band:
+    if scenario.kind == "sequence":
+        achieved = not np.isnan(move_times(steps, scenario.moves)).any()
+    elif move:
+        achieved = not math.isnan(settling_time)
+    else:
+        achieved = rms_error_evaluated <= band
+    if achieved:
         return SETTLED if move else FOLLOWED
     if isinstance(robot, HandEyeModel) and _is_out_of_reach(
         steps, robot, scenario.evaluate_from, band

@@ -14,7 +14,7 @@ hand about the target at home; ρ is at most 1, and smaller by as much as less o
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, TypeAlias, final
+from typing import Final, Literal, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +25,12 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.signals import Channel, column_unit
 from servobench.plant.robot.camera import CAMERA
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 MAX_BEGIN: Final = 1e6  # [s] after which the first waypoint is one of a clock that counts from 1970 or from a start-up
-TaskKind: TypeAlias = Literal["point_to_point", "curve"]
-"""Whether a task's reference is a fixed target or moves."""
+TaskKind: TypeAlias = Literal["point_to_point", "curve", "sequence"]
+"""Whether a task's reference is a fixed target, moves, or jumps from one target to the next."""
 
 
 class Reference(ABC):
@@ -154,6 +155,62 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
         return Waypoints(values[:, 0], values[:, 1:])
 
 
+class Segment(NamedTuple):
+    """A part of a path through which an arm is led: a rest, or a lap on an ellipse in the space of the joints."""
+
+    duration: float  # T [s]
+    middle: FloatArray  # c, (n,) [rad]
+    swings: FloatArray | None = None  # a and b, (2, n) [rad]; None where the arm rests
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class JointPath:
+    """Joint positions through which an arm is led, one segment after the other; the last one goes on.
+
+    q(t) = c_i + cos φ a_i + sin φ b_i,   φ = 2π (t − t_i) / T_i,   t_i the sum of the durations before
+    """
+
+    segments: tuple[Segment, ...]
+
+    @property
+    def ends(self) -> FloatArray:
+        """Times at which the segments end, (s,) [s]."""
+        return np.cumsum([each.duration for each in self.segments])
+
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the joint positions, (..., n) rad, at `time` (...), s."""
+        times = np.asarray(time, dtype=np.float64)
+        n = len(self.segments[0].middle)
+        postures = np.empty((*times.shape, n))
+        begin = 0.0
+        for segment, end in zip(self.segments, self.ends, strict=True):
+            since = times - begin
+            # A period's time is a product, and may be a rounding error before the sum of the durations.
+            under_way = since >= -1e-9
+            postures[under_way] = segment.middle
+            if segment.swings is not None:
+                phase = 2.0 * np.pi * since[under_way] / segment.duration
+                a, b = segment.swings
+                postures[under_way] += np.multiply.outer(np.cos(phase), a)
+                postures[under_way] += np.multiply.outer(np.sin(phase), b)
+            begin = end
+        return postures
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LedPlaces(Reference):
+    """The features, (m,), of an arm that is led along a path."""
+
+    model: RobotModel  # the true arm and its camera
+    path: JointPath
+
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the features at each time."""
+        return self.model.feature(self.path.at(time))
+
+
 @dataclass(frozen=True, eq=False)
 class ImageReference(Reference):
     """A desired place of the target over time, and its image."""
@@ -180,6 +237,18 @@ class TaughtImage(ImageReference):
         """Return the same place at all times."""
         points = self.model.points(self.joint_position)
         return np.broadcast_to(points, (*np.shape(time), *points.shape)).copy()
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LedImage(ImageReference):
+    """The target where it is while the arm is led along a path."""
+
+    path: JointPath
+
+    def points(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the place at each time."""
+        return self.model.points(self.path.at(time))
 
 
 @final

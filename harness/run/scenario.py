@@ -7,13 +7,16 @@ A task is a frozen dataclass below `Task` with a default for every field. The de
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self, TypeAlias, get_args
+from typing import ClassVar, NamedTuple, Self, TypeAlias, get_args
 
 import numpy as np
 
 from servobench.harness.run.references import (
     FixedPoint,
     FollowedCurve,
+    JointPath,
+    LedImage,
+    LedPlaces,
     Reference,
     TaskKind,
     TaughtImage,
@@ -28,6 +31,13 @@ from servobench.plant.robot.workspace import Workspace
 Vector: TypeAlias = tuple[float, ...]
 
 
+class Span(NamedTuple):
+    """A part of a run."""
+
+    begin: float  # [s]
+    end: float  # [s]
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A task made concrete for one true robot."""
@@ -38,8 +48,12 @@ class Scenario:
     reference: Reference  # the desired feature over time
     duration: float  # [s]
     evaluate_from: float  # where the evaluated part begins [s]
-    kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
+    kind: TaskKind = "curve"  # whether the reference is a fixed target, moves, or jumps
     lap_time: float = math.nan  # time of a lap of a curve that is repeated [s]; NaN of any other
+    moves: tuple[Span, ...] = ()  # parts of a sequence in which a target is held
+    jumps: tuple[
+        float, ...
+    ] = ()  # instants at which the reference jumps, which no preview shows [s]
 
     def __post_init__(self) -> None:
         """Check that the evaluated part is one of the run, and the kind."""
@@ -52,6 +66,8 @@ class Scenario:
             raise ValueError(
                 f"evaluate_from must be in the run of {self.duration:g} s, got {self.evaluate_from:g} s"
             )
+        if (self.kind == "sequence") != bool(self.moves):
+            raise ValueError("a sequence, and no other kind, has moves")
 
 
 @dataclass(frozen=True)
@@ -101,6 +117,17 @@ class TaskSetting:
                 "it is taught on a known robot, and this plant brings a robot of its own"
             )
         return self.robot, self.model
+
+    def led(self, path: JointPath) -> Reference:
+        """Return the desired features while the arm is led along a path, as a user would teach them one by one.
+
+        Raises:
+            ValueError: the plant brings a robot of its own.
+        """
+        model = self.taught_on()[1]
+        if isinstance(model, SetupModel):
+            return LedImage(model, path)
+        return LedPlaces(model, path)
 
     def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
         """Return the start of a run, (n,) rad, or None for a plant that brings its own."""

@@ -1,8 +1,11 @@
-"""Starts and targets for cameras that see pixels: drawn until the target is in view, or found for a displaced pose.
+"""Starts and targets: drawn in a box of joint positions until they are fit, or found for a displaced pose.
 
-A posture is fit if the nominal cameras see all features away from the edges of their images and the true ones see them
-at all, the target faces the first camera, the parts on the flange are above the table, and the workspace knows of no
-contact there. The box of joint positions from which postures are drawn keeps away from the limits.
+A posture is fit if what hangs on the flange is above the table and the workspace knows of no contact there. Where the
+camera is moved during the run, the arm reaches a target that was taught before it afterwards, too.
+
+Where cameras see pixels, it must also be that the nominal cameras see all features away from the edges of their images
+and the true ones see them at all, and that the target faces the first camera. The box of joint positions from which
+postures are drawn keeps away from the limits.
 
 The poses are those of the four canonical tasks of Gans, Hutchinson and Corke, "Performance Tests for Visual Servo
 Control Systems, with Application to Partitioned Approaches to Visual Servo Control", International Journal of Robotics
@@ -21,24 +24,30 @@ differently before the first camera:
 The start is found on the nominal arm. Where an arm cannot reach it with the target in view, D is made smaller.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from annotated_types import Gt, Le
 
-from servobench.harness.run.scenario import Scenario, Task, TaskSetting
+from servobench.harness.run.scenario import Scenario, Task, TaskSetting, Vector, numbers
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.lanes import norm
-from servobench.plant.contract.settings import Positive, settings
+from servobench.plant.contract.settings import Number, Positive, settings
 from servobench.plant.robot.camera import CAMERA
-from servobench.plant.robot.hand_eye import rotation_matrix
+from servobench.plant.robot.hand_eye import HandEyeModel, rotation_matrix
 from servobench.plant.robot.inverse import reach_pose
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
+from servobench.plant.robot.workspace import Workspace
 
+PLACES: Final = "start_and_target"  # name of the generator from which they are drawn
+MAX_PAIRS: Final = 1000  # pairs of start and target; one in two fits
+PAIRS_AT_ONCE: Final = 4
 DRAWN_AT_ONCE: Final = 256
 MAX_DRAWS: Final = 25_600
 # Shares of the images' half sides within which the planned and the true cameras see the features.
@@ -58,6 +67,108 @@ class Box(NamedTuple):
     upper: FloatArray  # (n,) [rad]
     shortest: float  # motion from start to target that the ball of the planned fixed camera would need [m]
     lowest: float  # height of the ball, or of the camera on the hand, above the table [m]
+
+
+@settings
+class BoxTask(Task):
+    """A task whose postures are drawn by the run's seed from a box of joint positions."""
+
+    lower: Vector = TRAINING_LOWER
+    """[rad] lower corner of the box"""
+    upper: Vector = TRAINING_UPPER
+    """[rad] upper corner of the box"""
+    shortest: Number = 0.1
+    """[m] least distance between start and target on the nominal model"""
+    lowest: Number = 0.08
+    """[m] least height of the ball above the table on the nominal model"""
+
+    def box(self, n: int) -> Box:
+        """Return where to draw the postures of an arm with n joints.
+
+        Raises:
+            ValueError: corners of another size, or exchanged.
+        """
+        lower, upper = (
+            as_array(f"its setting {name}", getattr(self, name), (n,))
+            for name in ("lower", "upper")
+        )
+        if not (lower < upper).all():
+            raise ValueError("lower must be below upper for every joint")
+        return Box(lower, upper, self.shortest, self.lowest)
+
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """See `Task.scaled`."""
+        return replace(
+            self,
+            lower=numbers(work.lower),
+            upper=numbers(work.upper),
+            shortest=work.scale * self.shortest,
+            lowest=work.scale * self.lowest,
+        )
+
+
+def drawn_moves(
+    box: Box, setting: TaskSetting, generator: np.random.Generator
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield joint positions of start and target, (n,) and (n,) rad, of moves that are fit.
+
+    Raises:
+        ValueError: too few postures are fit.
+    """
+    robot, true = setting.taught_on()
+    if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
+        while True:
+            yield draw_in_view(box, robot, setting.nominal, true, generator)
+    n = robot.n
+    clear = robot.workspace.clear
+    for _ in range(MAX_PAIRS // PAIRS_AT_ONCE):
+        pairs = generator.uniform(box.lower, box.upper, (PAIRS_AT_ONCE, 2, n))
+        balls = robot.arm.ball_position(pairs)
+        apart = norm(balls[:, 1] - balls[:, 0]) >= box.shortest
+        fit = apart & (balls[:, :, 2] >= box.lowest).all(axis=-1)
+        if clear is not None:
+            fit &= clear(pairs).all(axis=-1)
+        for start, target in pairs[fit]:
+            if stays_in_reach(target, box, setting):
+                yield start, target
+    least = (
+        f"apart by shortest = {box.shortest:g} m and above the table by lowest = {box.lowest:g} m"
+    )
+    raise ValueError(
+        f"no start and target between lower and upper are {least}; lessen these, or widen the box"
+    )
+
+
+def are_fit(postures: FloatArray, box: Box, setting: TaskSetting) -> npt.NDArray[np.bool_]:
+    """Return which of the postures (k, n) rad are fit, (k,), wherever the camera is moved."""
+    robot, true = setting.taught_on()
+    if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
+        return _fit(postures, box, robot, setting.nominal, true)
+    return _is_free(postures, box, robot)
+
+
+def are_apart(
+    postures: FloatArray, place: FloatArray, box: Box, setting: TaskSetting
+) -> npt.NDArray[np.bool_]:
+    """Return which of the postures (k, n) rad are as far from a place (n,) rad as a target from its start, (k,)."""
+    robot = setting.taught_on()[0]
+    if isinstance(setting.nominal, SetupModel):
+        features = setting.nominal.feature(postures)
+        least = box.shortest * setting.nominal.noise_unit
+        return np.asarray(norm(features - setting.nominal.feature(place)) >= least)
+    balls = robot.arm.ball_position(postures)
+    return np.asarray(norm(balls - robot.arm.ball_position(place)) >= box.shortest)
+
+
+def stays_in_reach(target: FloatArray, box: Box, setting: TaskSetting) -> bool:
+    """Return whether a target that was taught at (n,) rad before the camera's move is in easy reach after it."""
+    if not isinstance(setting.moved, HandEyeModel):
+        return True
+    robot, true = setting.taught_on()
+    point = setting.moved.to_base(true.feature(target))
+    nearest, farthest = robot.workspace.reach
+    distance = np.linalg.norm(point - robot.workspace.shoulder)
+    return bool(point[2] >= box.lowest and nearest <= distance <= farthest)
 
 
 def draw_in_view(
@@ -122,11 +233,17 @@ def _fit(
     drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: SetupModel
 ) -> npt.NDArray[np.bool_]:
     """Return which of the postures (k, n) rad are fit, (k,)."""
-    fit = robot.arm.ball_position(drawn)[:, 2] >= box.lowest
-    if robot.workspace.clear is not None:
-        fit &= robot.workspace.clear(drawn)
+    fit = _is_free(drawn, box, robot)
     fit[fit] = _in_view(drawn[fit], nominal, true)
-    return np.asarray(fit)
+    return fit
+
+
+def _is_free(postures: FloatArray, box: Box, robot: Robot) -> npt.NDArray[np.bool_]:
+    """Return in which postures (k, n) rad nothing touches the table or the arm, (k,)."""
+    free = robot.arm.ball_position(postures)[:, 2] >= box.lowest
+    if robot.workspace.clear is not None:
+        free &= robot.workspace.clear(postures)
+    return np.asarray(free)
 
 
 def _in_view(postures: FloatArray, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:

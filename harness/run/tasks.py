@@ -12,36 +12,30 @@ group `servobench.tasks`.
 from dataclasses import is_dataclass, replace
 from typing import Any, ClassVar, Final, Literal, Self
 
-import numpy as np
-
 from servobench.harness.config.entries import Kind, check_settings, summary_of
 from servobench.harness.config.registry import Registry
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
-from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
+from servobench.harness.run.sequences import AgainTask, TourTask
+from servobench.harness.run.starts import PLACES, BoxTask, PoseTask, drawn_moves, drawn_together
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray, as_array, check_number
+from servobench.plant.contract.checks import as_array, check_number
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
-from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import (
     Count,
     Duration,
     NonNegative,
-    Number,
     Positive,
     remark,
     settings,
 )
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT
-from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
+from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED
 from servobench.plant.robot.workspace import Workspace
 
-MAX_DRAWS: Final = 1000  # pairs of start and target; one in two fits
-DRAWN_AT_ONCE: Final = 4
 LONG_RUN: Final = 600.0  # [s]
 RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] radii of the curves on a UR5
 STRETCHED_START: Final = "singular_start"
@@ -110,63 +104,21 @@ class TargetTask(Task):
 
 
 @settings
-class RandomTask(Task):
+class RandomTask(BoxTask):
     """A move whose start and target are drawn by the run's seed from a box of joint positions.
 
     Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
     """
 
-    lower: Vector = TRAINING_LOWER
-    """[rad] lower corner of the box"""
-    upper: Vector = TRAINING_UPPER
-    """[rad] upper corner of the box"""
-    shortest: Number = 0.1
-    """[m] least distance between start and target on the nominal model"""
-    lowest: Number = 0.08
-    """[m] least height of the ball above the table on the nominal model"""
     duration: Duration = 10.0
     """[s] length of the run"""
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        robot, true = setting.taught_on()
-        n, clear = robot.n, robot.workspace.clear
-        lower, upper = (
-            as_array(f"its setting {name}", getattr(self, name), (n,))
-            for name in ("lower", "upper")
-        )
-        if not (lower < upper).all():
-            raise ValueError("lower must be below upper for every joint")
-        generator = named_generator(setting.seed, "start_and_target")
-        if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
-            box = Box(lower, upper, self.shortest, self.lowest)
-            start, target = draw_in_view(box, robot, setting.nominal, true, generator)
-            return setting.move(start, setting.taught(target), self.duration)
-        for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
-            pairs = generator.uniform(lower, upper, (DRAWN_AT_ONCE, 2, n))
-            balls = robot.arm.ball_position(pairs)
-            apart = norm(balls[:, 1] - balls[:, 0]) >= self.shortest
-            fit = apart & (balls[:, :, 2] >= self.lowest).all(axis=-1)
-            if clear is not None:
-                fit &= clear(pairs).all(axis=-1)
-            for start, target in pairs[fit]:
-                point = true.feature(target)
-                if _stays_in_reach(point, self.lowest, setting, robot):
-                    return setting.move(start, FixedPoint(point), self.duration)
-        least = f"apart by shortest = {self.shortest:g} m and above the table by lowest = {self.lowest:g} m"
-        raise ValueError(
-            f"no start and target between lower and upper are {least}; lessen these, or widen the box"
-        )
-
-    def scaled(self, name: str, work: Workspace) -> Self:
-        """See `Task.scaled`."""
-        return replace(
-            self,
-            lower=numbers(work.lower),
-            upper=numbers(work.upper),
-            shortest=work.scale * self.shortest,
-            lowest=work.scale * self.lowest,
-        )
+        box = self.box(setting.taught_on()[0].n)
+        generator = named_generator(setting.seed, PLACES)
+        start, target = next(drawn_moves(box, setting, generator))
+        return setting.move(start, setting.taught(target), self.duration)
 
 
 @settings
@@ -264,16 +216,6 @@ class WaypointTask(Task):
         return Scenario(setting.start(self.start), reference, duration, 0.5 * duration)
 
 
-def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, robot: Robot) -> bool:
-    """Return whether a target (m,) that was taught before the camera's move is in easy reach after it."""
-    if not isinstance(setting.moved, HandEyeModel):
-        return True
-    point = setting.moved.to_base(target)
-    nearest, farthest = robot.workspace.reach
-    distance = np.linalg.norm(point - robot.workspace.shoulder)
-    return bool(point[2] >= lowest and nearest <= distance <= farthest)
-
-
 EXP1, EXP2, EXP3, EXP4 = (PointTask(start=start, target=target) for start, target in MOVES.values())
 # 1.5 m straight on from the ball's start
 UNREACHABLE: Final = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)
@@ -297,6 +239,8 @@ _ENTRIES = (
     TaskEntry(
         "random", "start and target drawn by the seed from the training region", RandomTask()
     ),
+    TaskEntry("tour", "moves to six targets in a row, drawn by the seed", TourTask()),
+    TaskEntry("again", "a move, a curve, the way back and the same move again", AgainTask()),
     TaskEntry("target", "a move to a given feature (target.target)", TargetTask()),
     TaskEntry("endurance", "half an hour on the circle or the lemniscate", CurveTask(laps=180)),
     TaskEntry(
