@@ -12,6 +12,7 @@ from page_studies import cells
 from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import column_of, median_with_interval
+from servobench.harness.apps.studies.challenge import MEASURES
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import flatten
 
@@ -79,7 +80,7 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
     rows = []
     for (grade, name), runs in methods.groupby(["grade", "challenge"], sort=False):
         own = runs.set_index("controller")
-        unit = "s" if own["measure"].iloc[0] == "settling" else "mm"
+        unit = MEASURES[own["measure"].iloc[0]].unit
         row = {
             "challenge": f"`{name}`",
             "grade": grade,

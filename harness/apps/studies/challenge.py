@@ -2,7 +2,8 @@
 
     title, why         the world in some words, and a sentence of physics
     task, mismatch     as of a run; period [s], latency [s] and noise (a factor) where they differ from the usual ones
-    measure            settling: the settling time of a move; path: the RMS error of the judged part, as of the last lap
+    measure            settling: the settling time of a move; later: of the third and later moves of a sequence; path:
+                       the RMS error of the judged part, as of the last lap
     reference          methods that know the true robot; on each robot the better one bounds the others. They run on
                        the first `reference_seeds` robots, or on all
     [settings]         further settings, SECTION.KEY = VALUE, of the sections run, plant and task
@@ -28,6 +29,7 @@ from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.config.source import find_place
+from servobench.harness.run.references import TaskKind
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.sampling import draw
@@ -62,10 +64,16 @@ class Measure(NamedTuple):
     factor: float  # from the column to the unit in which it is shown
     unit: str  # unit in which it is shown
     achieved: str  # the word for a run that is not lost
+    kind: TaskKind | None = None  # kind of the tasks for which it is; None for all
+    tasks: str = ""  # word for these tasks
+    whole: bool = True  # whether a run whose outcome is bad is lost, or only one without a value
 
 
 MEASURES: Final[Mapping[str, Measure]] = {
-    "settling": Measure("settling_time_s", 0.05, 1.0, "s", "settled"),
+    "settling": Measure("settling_time_s", 0.05, 1.0, "s", "settled", "point_to_point", "moves"),
+    "later": Measure(
+        "settling_time_later_s", 0.05, 1.0, "s", "settled", "sequence", "sequences", whole=False
+    ),
     "path": Measure("rms_error_evaluated", 0.0015, 1000.0, "mm", "followed"),
 }
 
@@ -88,7 +96,7 @@ class Challenge:
     why: str = ""
     task: str = ""
     mismatch: str = "moderate"
-    measure: Literal["settling", "path"] = "settling"
+    measure: Literal["settling", "later", "path"] = "settling"
     reference: Names = ()
     plants: Names = ("kinematic", "fmu")
     camera: str = ""
@@ -155,11 +163,14 @@ class Challenge:
         run = resolve(first.request, Settings())
         own_robot = find_plant(run.request.plant).own_robot
         # A plant with a robot of its own draws no scenario here.
-        if self.measure != "settling" or own_robot:
+        measure = MEASURES[self.measure]
+        if measure.kind is None or own_robot:
             return
-        if draw(run).scenario.kind != "point_to_point":
+        kind = draw(run).scenario.kind
+        if kind != measure.kind:
+            fit = next(name for name, each in MEASURES.items() if each.kind in (kind, None))
             raise ValueError(
-                f"measure settling is for moves, and {self.task} is a curve; wanted path"
+                f"measure {self.measure} is for {measure.tasks}, and {self.task} is a {kind}; wanted {fit}"
             )
 
 

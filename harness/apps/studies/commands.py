@@ -73,7 +73,7 @@ def suite(
         str,
         option(
             CHALLENGE.several(),
-            "Comma-separated names, or .toml files of your own; default: all names.",
+            "Comma-separated names, or .toml files of your own; default: all with a grade.",
         ),
     ] = selection.ALL,
     grade: Annotated[
@@ -98,14 +98,16 @@ def suite(
 
     A score is the error or time of a method that knows the true robot over that of the method; a lost run has 0.
     """
-    from servobench.harness.apps.studies.challenge import choose_challenges
+    from servobench.harness.apps.studies.challenge import GRADES, choose_challenges
     from servobench.harness.apps.studies.suite import carry_out_suite, suite_tables
     from servobench.harness.batch.plan import parse_seeds
     from servobench.harness.cli.progress import watching
 
-    worlds = choose_challenges(
-        selection.split(_challenges, challenges, option="challenges"), split_words(grade)
-    )
+    grades = split_words(grade)
+    if challenges == selection.ALL and not grades:
+        grades = list(GRADES)  # the rankings of pages and stored tables have graded ones alone
+    words = selection.split(_challenges, challenges, option="challenges")
+    worlds = choose_challenges(words, grades)
     names = selection.split("controllers", controllers)
     where = selection.split("plants", plants) if plants else ()
     robots = parse_seeds(seeds)

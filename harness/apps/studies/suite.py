@@ -4,8 +4,9 @@ A challenge is a part of the results folder. On each robot the better of its ref
 
     score = min(1, max(reference, floor) / max(own, floor)),   0 for a lost run
 
-A run is lost if it does not settle, on a curve if it is not followed. A challenge whose references both lose more than
-`MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking.
+A run is lost if it does not settle, on a curve if it is not followed, in a sequence if one of the later moves does not
+settle. A challenge whose references both lose more than `MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no
+grade and no part in the ranking.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -102,7 +103,10 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
     measure = MEASURES[challenge.measure]
     floor = measure.factor * measure.floor
     measured = measure.factor * column_of(runs, measure.column).where(runs["status"] == COMPLETED)
-    value = measured.where(outcomes(runs).isin(ACHIEVED)).clip(lower=floor)
+    value = measured
+    if measure.whole:
+        value = measured.where(outcomes(runs).isin(ACHIEVED))
+    value = value.clip(lower=floor)
     robots = pd.MultiIndex.from_frame(runs[["plant", "seed"]])
     is_reference = runs["controller"].isin(challenge.reference)
     best = value[is_reference].groupby([runs["plant"], runs["seed"]]).min()

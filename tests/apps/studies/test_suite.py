@@ -13,6 +13,7 @@ from servobench.harness.apps.studies.challenge import (
     GRADES,
     MEASURES,
     Challenge,
+    Grade,
     challenge_names,
     choose_challenges,
     find_challenge,
@@ -41,14 +42,23 @@ plants = "kinematic"
 """
 
 
+# They are in no ranking and no stored table.
+UNGRADED = {
+    f"{world}_{task}" for world in ("zeros180", "unknown_arm") for task in ("tour", "again")
+}
+
+
 @pytest.mark.parametrize("name", challenge_names())
 def test_every_challenge_of_the_package_can_be_carried_out_and_says_why_it_is_there(name):
     challenge = find_challenge(name)
     assert challenge.why.endswith(".")
     assert challenge.plants == ("kinematic", "fmu")
-    assert challenge.grade.name in GRADES
-    assert challenge.grade.date is not None
-    assert len(challenge.grade.scores) > 4
+    if name in UNGRADED:
+        assert challenge.grade == Grade()
+    else:
+        assert challenge.grade.name in GRADES
+        assert challenge.grade.date is not None
+        assert len(challenge.grade.scores) > 4
     runs = challenge.cells((), ("ukf_mfac", "calibrated"), range(5), bounded=2)
     assert len({run.request.run_id for run in runs}) == len(runs) == 2 * (5 + 2 * 2)
 
@@ -79,7 +89,18 @@ def test_a_challenge_fixes_its_settings_by_role_on_every_plant():
             WORLD.replace("random", "circle"),
             "measure settling is for moves, and circle is a curve; wanted path",
         ),
-        (WORLD.replace("settling", "time"), "measure must be one of settling, path, got 'time'"),
+        (
+            WORLD.replace("random", "tour"),
+            "measure settling is for moves, and tour is a sequence; wanted later",
+        ),
+        (
+            WORLD.replace("settling", "later"),
+            "measure later is for sequences, and random is a point_to_point; wanted settling",
+        ),
+        (
+            WORLD.replace("settling", "time"),
+            "measure must be one of settling, later, path, got 'time'",
+        ),
         (WORLD + 'mismatch = "moderate+tol=3mm"', "world.toml: .*did you mean 'tool'"),
         (WORLD + "period = 0", "period must be above 0, got 0"),
         (
@@ -185,6 +206,33 @@ def test_scores_of_curves_are_in_millimetres_with_a_floor_and_need_a_reference_o
     np.testing.assert_allclose(own["measured"], [1.0, 6.0, 11.0, 4.0])
     np.testing.assert_allclose(own["value"], [1.5, 6.0, math.nan, 4.0])
     assert MEASURES["path"].floor == 0.0015
+
+
+def test_scores_of_sequences_are_of_their_later_moves_whether_or_not_the_first_one_settled():
+    values = {"mine": [0.8, 2.0, -1.0, math.nan], "calibrated": [0.4, 3.0, 1.0, 1.0]}
+    runs = table_of(values, "settling_time_later_s", "sequence", 0.005).assign(
+        outcome="not_settled"
+    )
+    judged = judge(challenge("later"), runs)
+    own = judged[judged["controller"] == "mine"]
+    np.testing.assert_allclose(own["score"], [0.5, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(own["reference"], [0.4, 3.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("name", sorted(UNGRADED))
+def test_a_world_of_later_moves_differs_from_that_of_single_ones_by_task_and_measure_alone(name):
+    own = find_challenge(name)
+    world, _, task = name.rpartition("_")
+    single = find_challenge(world)
+    assert (own.task, own.measure) == (task, "later")
+    same = ("mismatch", "reference", "plants", "period", "latency", "noise", "settings")
+    for key in same:
+        assert getattr(own, key) == getattr(single, key), key
+
+
+def test_the_challenges_without_a_grade_are_those_of_later_moves():
+    graded = choose_challenges(challenge_names(), GRADES)
+    assert set(challenge_names()) - {each.name for each in graded} == UNGRADED
 
 
 def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
