@@ -44,7 +44,10 @@ UNRENDERED = "kinematic"  # its plant where none of them is
 MAPPED = "fmu:"
 ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
-NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
+NOT_COMPOSED = {
+    "nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY",
+    "revealed": "servobench.controllers.revealed:ENTRY",
+}
 CONTROLLERS: Final[Mapping[str, ControllerEntry | str]] = {**METHODS, **NOT_COMPOSED}
 MAPPINGS: Final = (".fmu", ".toml")  # endings of an FMU, or of a mapping of its names
 

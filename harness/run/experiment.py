@@ -69,7 +69,7 @@ class Experiment:
         if moved:
             instant = int(run.camera_moves_at * self.periods)
             move = CameraMove(instant, self._in_lanes(moved))
-        jumps = tuple(math.ceil(each / run.period - 1e-9) for each in self.scenario.jumps)
+        jumps = self.scenario.jump_periods(run.period)
         lost_after = run.periods(run.lost_after)
         return LoopSettings(self.periods, run.preview_rows, lost_after, move, jumps)
 

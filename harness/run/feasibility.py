@@ -80,7 +80,8 @@ def check_features(run: ResolvedRun, drawn: Drawn, spec: PlantSpec, desired: Flo
         if unit == "m" and size > MAX_PLACE:
             remark(f"{task} reaches {size:g} m; if places are meant in mm, write the unit, too")
         return
-    distances = np.linalg.norm(np.diff(desired, axis=0), axis=1)
+    jumps = np.array(drawn.scenario.jump_periods(spec.period), dtype=np.intp)
+    distances = np.delete(np.linalg.norm(np.diff(desired, axis=0), axis=1), jumps - 1)
     speed = distances.max(initial=0.0) / spec.period
     J = true.jacobian(start)
     fastest = float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)

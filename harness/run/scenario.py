@@ -69,6 +69,10 @@ class Scenario:
         if (self.kind == "sequence") != bool(self.moves):
             raise ValueError("a sequence, and no other kind, has moves")
 
+    def jump_periods(self, period: float) -> tuple[int, ...]:
+        """Return the control periods, each of `period` s, in which the reference jumps."""
+        return tuple(math.ceil(each / period - 1e-9) for each in self.jumps)
+
 
 @dataclass(frozen=True)
 class TaskSetting:

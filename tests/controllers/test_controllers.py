@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from kit.nightly import NIGHTLY, some
 from kit.toy import KNOWLEDGE, SineModel, networks, plant_spec, seen
-from servobench.controllers import nmpc_calibrated
+from servobench.controllers import nmpc_calibrated, revealed
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, PUBLISHED, compose
@@ -33,7 +33,11 @@ COMPOSED = [
 ]
 EQUIPPED = [name for name in METHODS if not name.endswith(PUBLISHED)]
 CHECKED = some(EQUIPPED, "regression_mfac", "rbfnn_mfac", "ukf_mpc")
-ALL = [*COMPOSED, pytest.param(nmpc_calibrated.ENTRY, id="nmpc_calibrated")]
+ALL = [
+    *COMPOSED,
+    pytest.param(nmpc_calibrated.ENTRY, id="nmpc_calibrated"),
+    pytest.param(revealed.ENTRY, id="revealed"),
+]
 PREVIEW = 20
 SMALL = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 

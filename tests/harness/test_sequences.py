@@ -8,6 +8,7 @@ import pytest
 from kit.lanes import assert_rows_of_single_runs
 from servobench.harness.batch.consistency import find_contradiction
 from servobench.harness.config.settings import Settings
+from servobench.harness.run import feasibility
 from servobench.harness.run.episode import carry_out
 from servobench.harness.run.experiment import build
 from servobench.harness.run.log import Period, StepLog
@@ -15,6 +16,7 @@ from servobench.harness.run.loop import LoopSettings, Rollout
 from servobench.harness.run.metrics import judge_run, move_times
 from servobench.harness.run.outcome import find_outcome
 from servobench.harness.run.references import FixedPoint, JointPath, Segment
+from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.sampling import draw
@@ -143,6 +145,14 @@ def test_a_jump_is_not_seen_before_it_comes():
     for rollout.k in range(12):
         seen.append(rollout.reference[:, 0].tolist())
     assert seen == [[1.0] * 4] * 5 + [[2.0] * 4] * 5 + [[3.0] * 4] * 2
+
+
+def test_a_jump_is_no_speed_to_remark_on(monkeypatch):
+    said = []
+    monkeypatch.setattr(feasibility, "remark", said.append)
+    for task in ("tour", "again"):
+        build_once(resolve(request(task), Settings({})))
+    assert said == []
 
 
 def test_the_jumps_of_a_run_are_the_periods_in_which_its_reference_jumps():

@@ -105,7 +105,7 @@ def suite(
 
     grades = split_words(grade)
     if challenges == selection.ALL and not grades:
-        grades = list(GRADES)  # the rankings of pages and stored tables have graded ones alone
+        grades = GRADES  # the rankings of pages and stored tables have graded ones alone
     words = selection.split(_challenges, challenges, option="challenges")
     worlds = choose_challenges(words, grades)
     names = selection.split("controllers", controllers)
