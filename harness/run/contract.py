@@ -190,7 +190,14 @@ def _copied(observation: Observation) -> Observation:
     joints = _frozen(observation.joint_position)
     feature = _frozen(observation.feature)
     valid = _frozen(observation.valid)
-    return trusted_observation(observation.time, joints, feature, observation.feature_valid, valid)
+    return trusted_observation(
+        observation.time,
+        joints,
+        feature,
+        observation.feature_valid,
+        valid,
+        observation.capture_time,
+    )
 
 
 def _bytes(observation: Observation, reference: FloatArray) -> tuple[float | bytes, ...]:

@@ -19,6 +19,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any, Final, NamedTuple, Self, final
 
 import numpy as np
@@ -163,6 +164,24 @@ class Frame(NamedTuple):
     due: int | FloatArray
     feature: FloatArray  # (..., m)
     valid: BoolArray  # (..., m), which features are measured and will arrive
+    captured: FloatArray  # (...), exposure by the camera's clock [s]; NaN where it tells none
+
+
+class Shown(NamedTuple):
+    """What the controller sees of the frames that arrived up to a control instant."""
+
+    feature: FloatArray  # (..., m), the last valid one
+    valid: BoolArray  # (..., m), which features arrived for this instant
+    captured: FloatArray  # (...), as that of the `Frame` of the last valid feature
+
+    def newer(self, frame: Frame, arrived: BoolArray) -> Self:
+        """Return what is seen after a frame of which some features `arrived`, (..., m)."""
+        captured = self.captured
+        if captured is not frame.captured:
+            some = np.logical_or.reduce(arrived, axis=-1)
+            captured = np.where(some, frame.captured, captured)[()]
+        feature = np.where(arrived, frame.feature, self.feature)
+        return type(self)(feature, np.logical_or(self.valid, arrived), captured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +192,7 @@ class BenchState:
     commands: tuple[FloatArray, ...]  # commands under way, oldest first, one a control period
     frames: tuple[Frame, ...]  # frames under way, oldest first
     held: FloatArray  # (..., m), the last valid feature
+    captured: FloatArray  # (...), exposure of its frame by the camera's clock [s]
     sensor: Sensor  # its random streams, and the outliers and occlusions that last
     # (..., 4, 4), pose at the start of a camera that turns; None for others.
     camera: FloatArray | None
@@ -267,11 +287,14 @@ class Bench(Plant):
         latency = self._timing.latency
         # Frames that were exposed before the start and are due after it.
         exposed = filter(self._timing.exposes, range(1 - latency, 1))
-        self._frames = deque(Frame(step + latency, first, self._all_valid) for step in exposed)
-        self._held = first
+        self._frames = deque(
+            Frame(step + latency, first, self._all_valid, self._stamp(step)) for step in exposed
+        )
+        # The frame that is seen at the start was exposed before it, as those that follow were before their instants.
+        seen = next(filter(self._timing.exposes, count(-latency, -1)))
         self._k = 0
         self._camera = self._first_camera
-        return self._observation(joints, first, self._all_valid)
+        return self._observation(joints, Shown(first, self._all_valid, self._stamp(seen)))
 
     def step(self, command: Command) -> Observation:
         """Apply `command` for one period; see `Plant.step`."""
@@ -293,43 +316,35 @@ class Bench(Plant):
                 self._frames.append(self._sent(i))
         self._commands.popleft()
         self._k += 1
-        feature, valid = self._delivered(self._k * timing.steps)
-        return self._observation(joints, feature, valid)
+        return self._observation(joints, self._delivered(self._k * timing.steps))
 
-    def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
-        """Return the newest features that arrived since the last control instant, and which of them did, (..., m)."""
+    def _delivered(self, now: int) -> Shown:
+        """Return the newest features that arrived since the last control instant, and which of them did."""
         if self._sensor.jitters:
             return self._delivered_by_lane(now)
-        feature = self._held
-        valid = self._none_valid
+        shown = Shown(self._held, self._none_valid, self._captured)
         while self._frames and self._frames[0].due <= now:
-            _, newer, own = self._frames.popleft()
-            if own is self._all_valid:
-                feature = newer
-                valid = own
+            frame = self._frames.popleft()
+            if frame.valid is self._all_valid:
+                shown = Shown(frame.feature, frame.valid, frame.captured)
             else:
-                feature = np.where(own, newer, feature)
-                valid = np.logical_or(valid, own)
-        return feature, valid
+                shown = shown.newer(frame, frame.valid)
+        return shown
 
-    def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
+    def _delivered_by_lane(self, now: int) -> Shown:
         """Return the same as `_delivered` for lanes whose frames are due at different times."""
-        feature = self._held
-        valid = self._none_valid
+        shown = Shown(self._held, self._none_valid, self._captured)
         before = now - self._timing.steps
-        for due, newer, own in self._frames:
-            arrives = np.asarray(np.logical_and(before < due, due <= now))
-            fresh = np.logical_and(own, arrives[..., None])
-            feature = np.where(fresh, newer, feature)
-            valid = np.logical_or(valid, fresh)
+        for frame in self._frames:
+            arrives = np.asarray(np.logical_and(before < frame.due, frame.due <= now))
+            shown = shown.newer(frame, np.logical_and(frame.valid, arrives[..., None]))
         while self._frames and np.all(self._frames[0].due <= now):
             self._frames.popleft()
-        return feature, valid
+        return shown
 
-    def _observation(
-        self, joints: FloatArray, feature: FloatArray, valid: BoolArray
-    ) -> Observation:
+    def _observation(self, joints: FloatArray, shown: Shown) -> Observation:
         """Return the observation of the present period; features that do not arrive are held."""
+        feature, valid, captured = shown
         time = self._k * self._period
         whole = self._whole
         if valid is not self._all_valid:
@@ -337,8 +352,14 @@ class Bench(Plant):
             valid.setflags(write=False)
         joints.setflags(write=False)
         feature.setflags(write=False)
+        np.asarray(captured).setflags(write=False)
         self._held = feature
-        return trusted_observation(time, joints, feature, whole, valid)
+        self._captured = captured
+        return trusted_observation(time, joints, feature, whole, valid, captured)
+
+    def _stamp(self, step: int) -> FloatArray:
+        """Return when a frame that is exposed after a sub-step is so by the camera's clock, (...) [s]; NaN if unknown."""
+        return self._sensor.stamp(step * self._step)
 
     def _expose(self) -> FloatArray | None:
         """Return the feature as measured now, (..., m), with the sensor's disturbances; None if it is not found."""
@@ -373,7 +394,7 @@ class Bench(Plant):
         due: int | FloatArray = step + self._timing.latency
         if self._sensor.jitters:
             due = self._sensor.due(step, self._timing.latency, self._step)
-        return Frame(due, feature, valid)
+        return Frame(due, feature, valid, self._stamp(step))
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
@@ -387,6 +408,7 @@ class Bench(Plant):
             commands=tuple(self._commands),
             frames=tuple(self._frames),
             held=self._held,
+            captured=self._captured,
             sensor=sensor,
             camera=self._camera,
             world=self.world.save(),
@@ -405,6 +427,7 @@ class Bench(Plant):
         self.world.restore(state.world)
         self._k = state.period
         self._held = state.held
+        self._captured = state.captured
         self._camera = state.camera
         self._commands = deque(state.commands)
         self._frames = deque(state.frames)
@@ -425,6 +448,7 @@ class Bench(Plant):
         self._commands = deque(take(tuple(self._commands), lanes))
         self._frames = deque(take(tuple(self._frames), lanes))
         self._held = take(self._held, lanes)
+        self._captured = take(self._captured, lanes)
         if self._camera is not None and self._first_camera is not None:
             self._camera = self._camera[lanes]
             self._first_camera = self._first_camera[lanes]

@@ -3,6 +3,7 @@
     y = round_Δ(h(q) + σ·family + outlier)        the features of a frame, round_Δ to multiples of the quantum
     hidden(t) or lost                             a frame that arrives without the feature, or not at all
     latency + A (1 + sin(2π t/P)) + U(0, jitter)  between exposure and delivery; frames do not overtake each other
+    t + offset + drift t                          the stamp of a frame exposed at t, by the camera's clock
 
 Each part draws from a random stream of its own, frame by frame, so that switching one on changes no other.
 
@@ -92,6 +93,7 @@ class Sensor:
         self._occlusion = Spell.none(lead, np.zeros(lead)[()])
         # Number of the sub-step after which the last frame is delivered.
         self._due: FloatArray = np.zeros(lead)[()]
+        self._no_stamp: FloatArray = np.full(lead, np.nan)[()]
 
     def measured(self, feature: FloatArray) -> FloatArray:
         """Return a true feature, (..., m), as the next frame shows it."""
@@ -130,6 +132,16 @@ class Sensor:
             return None
         return absent
 
+    def stamp(self, time: float) -> FloatArray:
+        """Return what the camera's clock shows at `time` [s], (...) [s]; NaN without stamps."""
+        config = self._config
+        if not config.stamps:
+            return self._no_stamp
+        shown = time + config.clock_offset + config.clock_drift * time
+        stamp = np.full_like(self._no_stamp, shown)
+        stamp.setflags(write=False)
+        return stamp[()]
+
     def due(self, step: int, latency: int, size: float) -> FloatArray:
         """Return the sub-step after which a frame is delivered, (...), a fraction.
 
@@ -155,6 +167,7 @@ class Sensor:
         self._outlier = take(self._outlier, lanes)
         self._occlusion = take(self._occlusion, lanes)
         self._due = take(self._due, lanes)
+        self._no_stamp = take(self._no_stamp, lanes)
 
 
 def begin_probability(share: float, frames: int) -> float:

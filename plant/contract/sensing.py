@@ -95,6 +95,12 @@ class SensingConfig:
     """[s] P of this swing."""
     camera_turn: Annotated[NonNegative, Usual(3.2)] = 0.0
     """[rad/s] turning rate of the first camera about its optical axis."""
+    stamps: bool = False
+    """Whether frames carry the time at which they were exposed, by the camera's clock."""
+    clock_offset: Annotated[Number, Only(stamps=True)] = 0.0
+    """[s] of this clock at time 0."""
+    clock_drift: Annotated[Number, Gt(-1.0), Usual(1e-3), Only(stamps=True)] = 0.0
+    """[s/s] by which this clock gains."""
 
     def __post_init__(self) -> None:
         """Check the windows."""

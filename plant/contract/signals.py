@@ -6,8 +6,9 @@ command of instant t_k; the command acts on [t_k, t_{k+1}).
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Self
 
 import numpy as np
@@ -180,6 +181,8 @@ class Observation:
         feature: (..., m), in the unit of the plant's feature; the last valid one where `feature_valid` is false.
         feature_valid: (...), whether all of `feature` was measured for this instant.
         valid: (..., m), the same for each feature; if it is given, `feature_valid` follows from it, else the reverse.
+        capture_time: (...), s, when the frame of `feature` was exposed, by the camera's own clock, which has an unknown
+            constant offset; NaN where the camera gives none.
     """
 
     time: float
@@ -187,9 +190,10 @@ class Observation:
     feature: FloatArray
     feature_valid: bool | BoolArray = True
     valid: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    capture_time: float | FloatArray = math.nan
 
     def __post_init__(self) -> None:
-        """Check that everything is finite and freeze the arrays."""
+        """Check that everything is finite, but for a missing time of capture, and freeze the arrays."""
         as_array("time", self.time, ())
         for name in ("joint_position", "feature"):
             value = getattr(self, name)
@@ -205,11 +209,17 @@ class Observation:
         valid.flags.writeable = False
         object.__setattr__(self, "valid", valid)
         object.__setattr__(self, "feature_valid", bool(valid.all()))
+        captured = real_numbers("capture_time", self.capture_time)
+        if captured.ndim or np.isinf(captured):
+            raise ValueError(
+                f"capture_time must be a time in s, or NaN for none, got {captured.tolist()}"
+            )
+        object.__setattr__(self, "capture_time", float(captured))
 
     def with_values(self, joint_position: FloatArray, feature: FloatArray) -> Observation:
         """Return this observation with other joint positions and another feature, which are finite."""
         return trusted_observation(
-            self.time, joint_position, feature, self.feature_valid, self.valid
+            self.time, joint_position, feature, self.feature_valid, self.valid, self.capture_time
         )
 
 
@@ -253,6 +263,7 @@ def trusted_observation(
     feature: FloatArray,
     feature_valid: bool | BoolArray,
     valid: BoolArray,
+    capture_time: float | FloatArray = math.nan,
 ) -> Observation:
     """Return an observation of arrays that are known to be fresh, finite, float64 and read-only.
 
@@ -265,14 +276,19 @@ def trusted_observation(
     _set_feature(observation, feature)
     _set_feature_valid(observation, feature_valid)
     _set_valid(observation, valid)
+    _set_capture_time(observation, capture_time)
     return observation
 
 
 _new = object.__new__
-_set_time, _set_joints, _set_feature, _set_feature_valid, _set_valid = (
-    getattr(Observation, name).__set__
-    for name in ("time", "joint_position", "feature", "feature_valid", "valid")
-)
+(
+    _set_time,
+    _set_joints,
+    _set_feature,
+    _set_feature_valid,
+    _set_valid,
+    _set_capture_time,
+) = (getattr(Observation, each.name).__set__ for each in fields(Observation))
 
 
 def column_names(spec: PlantSpec) -> dict[str, list[str]]:

@@ -140,3 +140,54 @@ def test_closing_closes_the_world():
     plant = bench()
     plant.close()
     assert plant.world.closed == 1
+
+
+STAMPED = {"stamps": True, "clock_offset": 1e3, "clock_drift": 1e-3}
+
+
+def shown_at(time):
+    """Return what the clock of `STAMPED` shows."""
+    return time + 1e3 + 1e-3 * time
+
+
+def test_without_stamps_no_time_of_capture_is_known():
+    assert all(np.isnan(seen.capture_time) for seen in walk(bench(sensing=SensingConfig(0.0, 0.2))))
+
+
+@pytest.mark.parametrize(
+    "late", [{}, {"jitter": 0.35}, {"latency_swing": 0.15, "swing_period": 1.0}]
+)
+def test_a_stamp_is_the_exposure_of_the_frame_that_is_seen_however_late_it_comes(late):
+    """The joint moves by 0.5 rad/s from 0 s on, so the feature tells when its frame was exposed."""
+    plant = bench(sensing=SensingConfig(0.0, 0.2, **late, **STAMPED), seed=4)
+    seen = walk(plant, np.full((60, 2), 0.5))
+    exposed = np.array([each.feature[0] / 0.5 for each in seen])
+    moving = exposed > 0.0
+    assert moving.sum() > 50
+    stamps = np.array([each.capture_time for each in seen])
+    np.testing.assert_allclose(stamps[moving], shown_at(exposed[moving]), atol=1e-9)
+    ages = np.array([each.time for each in seen]) - exposed
+    assert (np.ptp(ages[moving]) > 0.2) == bool(late)
+
+
+def test_the_first_frame_was_exposed_a_latency_before():
+    plant = Bench(Counter(), 0.0, SensingConfig(0.0, 0.2, stamps=True))
+    assert plant.reset(0).capture_time == pytest.approx(-0.2)
+    slow = Bench(Counter(), 0.0, SensingConfig(0.0, 0.1, frame_period=0.3, stamps=True))
+    stamps = [slow.reset(0).capture_time, *(each.capture_time for each in walk(slow))]
+    np.testing.assert_allclose(stamps[:8], [-0.3, 0, 0, 0, 0.3, 0.3, 0.3, 0.6], atol=1e-12)
+
+
+def test_a_frame_without_a_feature_leaves_the_stamp_of_the_last_one():
+    plant = bench(sensing=SensingConfig(0.0, stamps=True), hidden=(2, 3))
+    stamps = [each.capture_time for each in walk(plant, np.zeros((5, 2)))]
+    np.testing.assert_allclose(stamps, [0.1, 0.1, 0.1, 0.4, 0.5], atol=1e-12)
+
+
+def test_a_saved_state_restores_the_stamps():
+    plant = bench(sensing=SensingConfig(0.01, 0.2, 0.3, jitter=0.2, **STAMPED), seed=5)
+    walk(plant)
+    state = pickle.loads(pickle.dumps(plant.save()))
+    first = [each.capture_time for each in walk(plant)]
+    plant.restore(state)
+    assert [each.capture_time for each in walk(plant)] == first

@@ -22,11 +22,14 @@ STARTS = np.array(HOME) + np.random.default_rng(0).uniform(-0.3, 0.3, (3, 6))
 PERIODS, MOVE = 70, 40  # further than one block of random numbers
 COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (PERIODS, 3, 6))
 MOVED = np.array([mismatched("camera_rotation=40deg", seed).X_BC for seed in SEEDS])
-WORST = {"command_delay": 0.15, "latency": 0.1, "drop_probability": 0.2, "camera_turn": 0.3}
+WORST = {
+    "command_delay": 0.15, "latency": 0.1, "drop_probability": 0.2, "camera_turn": 0.3, "stamps": True,
+}  # fmt: skip
 # Sub-steps of 10 ms
 FINE = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3}
 DISTURBED = {
     "noise": "stable", "latency": 0.05, "jitter": 0.09, "latency_swing": 0.1, "swing_period": 2.0,
+    "stamps": True, "clock_offset": 7.0,
     "outliers": 0.3, "outlier_duration": 0.2, "quantum": 1e-4,
     "occlusions": 0.2, "occlusion_duration": 0.3, "occlusion_windows": ((1.2, 1.4),),
 }  # fmt: skip
@@ -77,7 +80,8 @@ def walk(plant, chosen, periods=range(PERIODS)):
             plant.move_camera(MOVED[chosen])
         seen, truth = plant.step(Command(COMMANDS[k, chosen])), plant.truth()
         assert not any(
-            each.flags.writeable for each in (seen.joint_position, seen.feature, seen.valid)
+            each.flags.writeable
+            for each in (seen.joint_position, seen.feature, seen.valid, seen.capture_time)
         )
         rows.append(
             (
@@ -85,6 +89,7 @@ def walk(plant, chosen, periods=range(PERIODS)):
                 seen.feature,
                 seen.feature_valid,
                 seen.valid,
+                seen.capture_time,
                 truth.feature,
                 truth.jacobian,
             )

@@ -118,3 +118,13 @@ def test_command_limits_must_be_symmetric():
     )
     with pytest.raises(ValueError, match="command limits must be symmetric"):
         PlantSpec(feature, command, -one, one, 0.1)
+
+
+def test_a_time_of_capture_is_a_number_or_missing():
+    assert np.isnan(Observation(0.0, [0.0], [0.0]).capture_time)
+    given = Observation(0.0, [0.0], [0.0], capture_time=np.float64(7.5))
+    assert given.capture_time == 7.5
+    assert given.with_values(given.joint_position, given.feature).capture_time == 7.5
+    for wrong in (np.inf, [1.0], None, "soon"):
+        with pytest.raises(ValueError, match="capture_time must"):
+            Observation(0.0, [0.0], [0.0], capture_time=wrong)

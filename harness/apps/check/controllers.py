@@ -363,7 +363,7 @@ class ControllerChecks:
 
 
 def _together(seen: Sequence[Observation]) -> Observation:
-    names = "joint_position", "feature", "feature_valid", "valid"
+    names = "joint_position", "feature", "feature_valid", "valid", "capture_time"
     return trusted_observation(
         seen[0].time, *(np.stack([getattr(each, name) for each in seen]) for name in names)
     )

@@ -229,10 +229,11 @@ class PlantChecks:
         return [Command(u) for u in drawn * spec.joint_velocity_limit]
 
 
-def _bits(observation: Observation) -> tuple[bytes, bytes, bool]:
+def _bits(observation: Observation) -> tuple[bytes, bytes, bytes, bool]:
     return (
         observation.joint_position.tobytes(),
         observation.feature.tobytes(),
+        np.float64(observation.capture_time).tobytes(),
         bool(observation.feature_valid),
     )
 
