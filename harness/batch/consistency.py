@@ -122,7 +122,7 @@ def _find_beside(row: Mapping[str, Any], steps: pd.DataFrame, period: float) -> 
 
 
 def _as_logged(steps: pd.DataFrame, band: float, period: float) -> Steps:
-    """Return a table of steps as the log that it was made of, without Jacobians."""
+    """Return a table of steps as the log that it was made of, without Jacobians and stamps of frames."""
 
     def numbers(kind: str) -> FloatArray:
         return steps[[name for name in steps.columns if name.startswith(f"{kind}_")]].to_numpy(
@@ -146,6 +146,7 @@ def _as_logged(steps: pd.DataFrame, band: float, period: float) -> Steps:
         joint_position=numbers("joint_position"),
         command=command,
         feature_valid=steps["feature_valid"].to_numpy(np.bool_),
+        capture_time=unknown[:, 0, 0],
         estimated_jacobian=unknown,
         true_jacobian=unknown,
         controller_time=steps["controller_time_us"].to_numpy(np.float64),

@@ -46,6 +46,7 @@ class Steps:
     joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
     command: FloatArray  # (k, ..., n) [rad/s]
     feature_valid: npt.NDArray[np.bool_]  # (k, ...), whether a measurement arrived
+    capture_time: FloatArray  # (k, ...), exposure of the last one by the camera's clock [s]
     # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
     estimated_jacobian: FloatArray
     true_jacobian: FloatArray  # (k, ..., m, n) [unit of the feature per rad]
@@ -103,6 +104,8 @@ class Steps:
         columns["jacobian_error"] = self.jacobian_error()
         columns["jacobian_condition"] = self.jacobian_condition()
         columns["feature_valid"] = self.feature_valid
+        if not np.isnan(self.capture_time).all():
+            columns["capture_time_s"] = self.capture_time
         columns["controller_time_us"] = self.controller_time
         columns["plant_time_us"] = self.plant_time
         columns.update((f"diagnostic_{name}", values) for name, values in self.diagnostics.items())
@@ -146,6 +149,7 @@ class StepLog:
             joint_position=empty(spec.n),
             command=empty(spec.n),
             feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
+            capture_time=empty(),
             estimated_jacobian=empty(spec.m, spec.n),
             true_jacobian=empty(spec.m, spec.n),
             controller_time=np.full(periods, np.nan),
@@ -172,6 +176,7 @@ class StepLog:
         rows.joint_position[k] = observation.joint_position
         rows.command[k] = period.command.joint_velocity
         rows.feature_valid[k] = observation.feature_valid
+        rows.capture_time[k] = observation.capture_time
         if estimate is not None:
             rows.estimated_jacobian[k] = estimate
         if truth.jacobian is not None:

@@ -150,6 +150,17 @@ def test_a_table_holds_what_was_logged_under_names_with_units():
     assert table["controller_time_us"].tolist() == [1.0, 2.0, 3.0, 4.0]
 
 
+def test_stamps_of_frames_have_a_column_where_there_are_any():
+    log = StepLog(SPEC, 2)
+    for k, captured in enumerate((np.nan, 1e3)):
+        seen = Observation(float(k), [0.0, 0.0], [0.0, 0.0], capture_time=captured)
+        given = Command([0.0, 0.0]), Truth(np.zeros(2), None), (1, 1)
+        log.add(Period(seen, np.zeros((1, 2)), *given), None, {})
+    table = log.steps().table("one")
+    assert list(table)[list(table).index("feature_valid") + 1] == "capture_time_s"
+    np.testing.assert_array_equal(table["capture_time_s"], [np.nan, 1e3])
+
+
 def test_a_diagnostic_that_comes_late_is_unknown_before():
     log = straight_move(
         ({"probing": 1.0}, {"probing": 1.0}, {"probing": 0.0, "noise": 0.5}, {"noise": 0.25})

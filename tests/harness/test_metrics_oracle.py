@@ -31,7 +31,7 @@ def random_log(seed, periods=40, calm=False):
     return Steps(
         SPEC, np.arange(periods) * PERIOD, reference, rng.normal(size=(periods, 3)),
         reference + decay * rng.normal(size=(periods, 3)), rng.normal(size=(periods, 2)), command,
-        rng.random(periods) < 0.8, estimate, jacobian, rng.uniform(0.0, 1.5e5, periods),
+        rng.random(periods) < 0.8, np.full(periods, np.nan), estimate, jacobian, rng.uniform(0.0, 1.5e5, periods),
         rng.uniform(0.0, 10.0, periods), {},
     )  # fmt: skip
 
@@ -150,7 +150,7 @@ def test_the_logs_above_reach_every_branch():
 def test_runs_side_by_side_are_judged_as_single_ones():
     logs = [random_log(seed) for seed in range(3)]
     names = ("reference", "feature", "true_feature", "joint_position", "command", "feature_valid",
-             "estimated_jacobian", "true_jacobian")  # fmt: skip
+             "capture_time", "estimated_jacobian", "true_jacobian")  # fmt: skip
     unknown = np.full(40, np.nan)
     lanes = {name: np.stack([getattr(log, name) for log in logs], axis=1) for name in names}
     steps = Steps(
