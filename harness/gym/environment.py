@@ -38,6 +38,7 @@ from servobench.plant.robot.mismatch import Mismatch
 
 Floats32: TypeAlias = npt.NDArray[np.float32]
 FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors are clipped
+LATENESS_BOUND: Final = 2.0  # [s] beyond which the lateness of a frame is clipped
 
 
 @final
@@ -51,18 +52,25 @@ class Spaces:
     | reference minus feature, now and for each row of the preview | (1 + preview) m | the same |
     | whether each feature was measured | m | 0 or 1 |
     | last action | n | share of the joints' speed limits |
+    | with stamps: how much older the frame is than the first one was | 1 | s |
+    | with stamps: whether that is known | 1 | 0 or 1 |
 
     Positions are clipped to the joints' limits and features to ten natural sizes, so that the space is bounded.
     """
 
-    def __init__(self, spec: PlantSpec, preview: int) -> None:
-        """Take the plant's spec and the number of future rows of the reference."""
+    def __init__(self, spec: PlantSpec, preview: int, *, stamps: bool = False) -> None:
+        """Take the plant's spec, the number of future rows of the reference, and whether frames are stamped."""
         self.spec = spec
+        self._stamps = stamps
+        self._first_age: float | FloatArray = np.nan
         feature = np.full(spec.m, FEATURE_BOUND)
         error = np.full((1 + preview) * spec.m, 2 * FEATURE_BOUND)
         ones = np.ones(spec.n)
         lower = np.concatenate([spec.joint_lower, -feature, -error, np.zeros(spec.m), -ones])
         upper = np.concatenate([spec.joint_upper, feature, error, np.ones(spec.m), ones])
+        if stamps:
+            lower = np.append(lower, [-LATENESS_BOUND, 0.0])
+            upper = np.append(upper, [LATENESS_BOUND, 1.0])
         self._lower, self._upper = lower.astype(np.float32), upper.astype(np.float32)
         self.observations = Box(self._lower, self._upper, dtype=np.float32)
         self.actions = Box(-1.0, 1.0, (spec.n,), np.float32)
@@ -88,6 +96,10 @@ class Spaces:
             raise ValueError(f"action must be an array of numbers, got {given!r}")
         return as_array("action", numbers, (*lanes, self.spec.n))
 
+    def begin(self, observation: Observation) -> None:
+        """Take the first observation of a run, (...), to whose unknown age those of other frames are relative."""
+        self._first_age = observation.time - observation.capture_time
+
     def observe(
         self, observation: Observation, reference: FloatArray, action: npt.ArrayLike
     ) -> Floats32:
@@ -106,6 +118,11 @@ class Spaces:
         action = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
         parts = observation.joint_position, feature / scale, errors.reshape(*feature.shape[:-1], -1)
         whole = np.concatenate([*parts, observation.valid.astype(np.float64), action], axis=-1)
+        if self._stamps:
+            lateness = observation.time - observation.capture_time - self._first_age
+            known = np.isfinite(lateness)
+            stamp = np.stack([np.where(known, lateness, 0.0), known], axis=-1)
+            whole = np.concatenate([whole, stamp], axis=-1)
         return np.clip(whole.astype(np.float32), self._lower, self._upper)
 
     def error(self, truth: Truth, desired: FloatArray) -> FloatArray:
@@ -191,7 +208,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self._experiment: Experiment | None = None
         self._rollout: Rollout | None = None
         self._over = True
-        self._spaces = Spaces(experiment.plant.spec, self.resolved.run.preview_rows)
+        self._spaces = Spaces(
+            experiment.plant.spec, self.resolved.run.preview_rows, stamps=experiment.plant.stamps
+        )
         self.metadata = self.metadata | {"render_fps": 1.0 / self._spaces.spec.period}
         self._outside: OutsideScene | None = None
         self.natural_size = self._spaces.spec.feature.scale
@@ -253,6 +272,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             )
             info["reason"] = str(fault)
         self._rollout = Rollout(experiment.plant, observation, desired, experiment.loop)
+        self._spaces.begin(observation)
         return self._observe(self._rollout), info
 
     def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, dict[str, Any]]:
@@ -477,10 +497,11 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             [with_seed(self._resolved, each) for each in seeds.tolist()]
         )
         bench = self._bench = cast(Bench, many.plant)
-        self._spaces = Spaces(bench.spec, many.loop.preview)
+        self._spaces = Spaces(bench.spec, many.loop.preview, stamps=bench.stamps)
         self._ended = False
         self._action: FloatArray = np.zeros((self.num_envs, bench.spec.n))
         observation = bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
+        self._spaces.begin(observation)
         # Also after the last
         self._rollout = Rollout(bench, observation, many.desired(many.periods + 1), many.loop)
         return self._observe(), {"seed": seeds}

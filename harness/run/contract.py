@@ -128,6 +128,7 @@ class HeldPlant(Plant):
         """Take a plant."""
         self._plant = plant
         self.spec = plant.spec
+        self.stamps = plant.stamps
 
     def reset(self, seed: int) -> Observation:
         """See `Plant.reset`."""

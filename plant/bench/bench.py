@@ -226,6 +226,7 @@ class Bench(Plant):
         """
         self.world = world
         self._sensing = sensing
+        self.stamps = sensing.stamps or world.stamps
         self._command_delay = command_delay
         spec = world.spec
         self._extents = sensing.extents(spec.feature.unit, world.noise_unit)
@@ -358,7 +359,10 @@ class Bench(Plant):
         return trusted_observation(time, joints, feature, whole, valid, captured)
 
     def _stamp(self, step: int) -> FloatArray:
-        """Return when a frame that is exposed after a sub-step is so by the camera's clock, (...) [s]; NaN if unknown."""
+        """Return the camera's clock, (...) [s], as a frame is exposed after a sub-step; NaN where it is unknown."""
+        captured = self.world.captured()
+        if captured is not None:
+            return captured
         return self._sensor.stamp(step * self._step)
 
     def _expose(self) -> FloatArray | None:

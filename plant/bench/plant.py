@@ -53,6 +53,8 @@ class Abilities(ABC):
     """Sizes, names, limits and period; set on construction."""
     own_robot: ClassVar[bool] = False
     """Whether it brings a robot and a start of its own, of a class that is given without a `PlantEntry`."""
+    stamps: bool = False
+    """Whether observations have a time of capture."""
     faults: Mapping[int, RunFault] = MappingProxyType({})
     """Of runs side by side: the lanes that failed, which `keep` has to drop. A single run raises instead."""
 
@@ -294,6 +296,10 @@ class World(Abilities):
 
     def visible(self) -> BoolArray | None:
         """Return which features of the last measurement are valid, (..., m); None for all of them."""
+        return None
+
+    def captured(self) -> FloatArray | None:
+        """Return when the last measurement was exposed, by the camera's own clock, (...) [s]; None where unknown."""
         return None
 
     def rehearse(self) -> None:

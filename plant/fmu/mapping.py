@@ -132,6 +132,8 @@ class FmuMapping:
     """Joint positions, rad; without them, commands are integrated."""
     seen: Names = ()
     """Which features are seen: true, or above 0.5, for each of them that is; without it all are."""
+    captured: str | None = None
+    """An output that is the time [s] at which the features were exposed, by the camera's clock."""
     truth: TruthMapping = nested(TruthMapping)
     """For evaluation only."""
     home: str | None = None
@@ -218,6 +220,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     truth = mapping.truth
     home = () if mapping.home is None else (mapping.home,)
     camera = mapping.camera or ()
+    captured = () if mapping.captured is None else (mapping.captured,)
     unit = mapping.names.feature_unit
     # Role, names, number of values, unit.
     roles = (
@@ -225,6 +228,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("joints", mapping.joints, n, "rad"),
         ("features", mapping.features, m, unit),
         ("seen", mapping.seen, m, "1"),
+        ("captured", captured, 1, "s"),
         ("truth.features", truth.features, m, unit),
         ("truth.jacobian", truth.jacobian, n * m, f"{unit}/rad"),
         ("truth.states", truth.states, n, "rad"),

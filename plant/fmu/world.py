@@ -96,6 +96,7 @@ class FmuWorld(World):
     """y, q ← fmi…GetReal after fmi…DoStep under the held command, with an instance for each run side by side."""
 
     _seen: BoolArray | None = None
+    _captured: FloatArray | None = None
 
     def __init__(
         self,
@@ -163,7 +164,10 @@ class FmuWorld(World):
         self._has_joints = bool(mapping.joints)
         self._command = self._port("inputs", mapping.inputs)
         measured = (*mapping.joints, *mapping.features, *mapping.seen)
-        self._result = self._port("joints, features and seen", measured)
+        self.stamps = mapping.captured is not None
+        if mapping.captured is not None:
+            measured = (*measured, mapping.captured)
+        self._result = self._port("joints, features, seen and captured", measured)
         true_features = truth.features or mapping.features
         self._truth = self._port("truth", (*true_features, *truth.jacobian))
         # Joints come first in a row of results.
@@ -255,7 +259,9 @@ class FmuWorld(World):
         self._joints = values[..., :first] if self._has_joints else self._integrated
         self._feature = values[..., first:end]
         if self._mapping.seen:
-            self._seen = values[..., end:] > SEEN_ABOVE
+            self._seen = values[..., end : end + self.spec.m] > SEEN_ABOVE
+        if self.stamps:
+            self._captured = values[..., -1]
 
     def _not_finite(self, values: FloatArray) -> FmuError:
         """Return the fault of a row of results, which names those that are not finite."""
@@ -274,6 +280,10 @@ class FmuWorld(World):
     def visible(self) -> BoolArray | None:
         """Return which features are valid by the FMU; see `World.visible`."""
         return self._seen
+
+    def captured(self) -> FloatArray | None:
+        """Return the time of capture by the FMU; see `World.captured`."""
+        return self._captured
 
     def rehearse(self) -> None:
         """Remark on joints and features that jump from exactly 0 while the arm rests; see `World.rehearse`.

@@ -19,9 +19,12 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
+from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ConfigurationError, FmuError
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
+from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.robot.mismatch import Mismatch
@@ -102,6 +105,23 @@ def test_the_clock_of_an_fmu_goes_on_from_its_start_time(opened):
         world.advance(np.zeros(2))
         seen.append(world.see()[1] - TIP[1])
     np.testing.assert_allclose(seen, [0.05, 0.0, 0.0, 0.0], atol=1e-15)
+
+
+def test_an_output_can_be_the_time_of_capture(tmp_path):
+    (tmp_path / "whole").mkdir()
+    other = build_stub(tmp_path / "whole")
+    path = build_stub(tmp_path)
+    named = 'features = ["y[1]"]\ncaptured = "y[2]"'
+    path.write_text(path.read_text().replace('features = ["y"]', named))
+    whole = FmuWorld(read_mapping(FmuMapping, other), None, 0.05)
+    plant = Bench(FmuWorld(read_mapping(FmuMapping, path), None, 0.05), 0.0, SensingConfig(0.0))
+    assert plant.stamps
+    assert plant.reset(0).capture_time == whole.see()[1]
+    for _ in range(3):
+        whole.advance(np.array([0.3, 0.1]))
+        assert plant.step(Command([0.3, 0.1])).capture_time == whole.see()[1]
+    plant.close()
+    whole.close()
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from multiprocessing import get_context
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeAwareObservation
 from gymnasium.wrappers.vector import DictInfoToList
 
@@ -304,3 +305,44 @@ def test_an_argument_that_is_a_setting_is_refused_with_the_place_of_settings():
         gymnasium.make(ENVIRONMENT, latency=0.1)
     env = ServoEnv(settings={"kinematic": {"sensing.latency": 0.1, "lag": 0.02}})
     assert env.resolved.plant.sensing.latency == 0.1
+
+
+STAMPED = {"kinematic": {"sensing": {"latency": 0.1, "jitter": 0.2, "stamps": True}}}
+SHIFTED = {"kinematic": {"sensing": {**STAMPED["kinematic"]["sensing"], "clock_offset": 1e9}}}
+
+
+def test_stamps_of_frames_are_ages_relative_to_that_of_the_first_one():
+    """The checker of Gymnasium finds nothing, and the unknown offset of the clock changes nothing."""
+    plain = ServoEnv(task="exp1", settings={"kinematic": {"sensing": {"latency": 0.1}}})
+    size = plain.observation_space.shape[0]
+    env, other = (ServoEnv(task="exp1", settings=each) for each in (STAMPED, SHIFTED))
+    assert env.observation_space.shape == (size + 2,)
+    check_env(env, skip_render_check=True)
+    found = [each.reset(seed=3)[0] for each in (env, other)]
+    ages = []
+    for _ in range(40):
+        np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+        look = env.observation
+        age, known = found[0][-2:]
+        assert known == 1.0
+        # The first frame is one latency old.
+        assert age == pytest.approx(look.time - look.capture_time - 0.1, abs=1e-6)
+        ages.append(age)
+        found = [each.step(np.full(6, 0.1))[0] for each in (env, other)]
+    assert np.ptp(ages) > 0.1
+    for each in (plain, env, other):
+        each.close()
+
+
+def test_lanes_with_stamps_are_single_episodes():
+    many = ServoVectorEnv(num_envs=2, task="exp1", settings=STAMPED)
+    seen, _ = many.reset(seed=[3, 4])
+    alone = [ServoEnv(task="exp1", settings=STAMPED) for _ in range(2)]
+    for lane, env in enumerate(alone):
+        np.testing.assert_array_equal(seen[lane], env.reset(seed=3 + lane)[0])
+    for _ in range(5):
+        seen, *_ = many.step(np.full((2, 6), 0.1))
+        for lane, env in enumerate(alone):
+            np.testing.assert_array_equal(seen[lane], env.step(np.full(6, 0.1))[0])
+    for each in (many, *alone):
+        each.close()
