@@ -131,7 +131,9 @@ class Estimation:
         known = ends_motion & (duration > 0.0) & (duration < self._longest)
         learned = branch(known, self._learn, learned, last, observation, desired, valid)
         if self.pairing is not None:
-            pair = branch(due & np.logical_not(known), self.pairing.interrupt, learned.pair)
+            pair = branch(
+                due & np.logical_not(known), self.pairing.interrupt, learned.pair, observation
+            )
             believed = pair.anchor.miss == 0.0
             anchor = choose(believed, learned.estimator, learned.anchor)
             learned = learned._replace(anchor=anchor, pair=pair)
@@ -230,7 +232,7 @@ class Estimation:
         noise = None
         explained = np.zeros_like(dy)
         if self.pairing is not None:
-            pair, paired = self.pairing.learn(pair, dy, duration, valid)
+            pair, paired = self.pairing.learn(pair, dy, duration, valid, observation)
             q = paired.joint_position
             dq = paired.joint_step
             dy = paired.feature_step

@@ -15,6 +15,10 @@ A false frame shows once a later one is seen, by ν of the motion since the last
                                                  since the anchor, as if the false frame had been lost
 
 σ keeps the innovations of false frames, as it would stay too small without all large ones.
+
+Stamps tell how old each frame is but for the offset of the camera's clock. A frame that is older than the first one by
+Δa belongs to the joint positions d + Δa ago, so that the constant d is found as before and no jitter is left.
+
 The error E is necessary: where the model is wrong by more than a map, filters without E take the error for noise, and
 find the delay at which it happens to be smallest. The first sample of the noise σ is a guess (`noise_level`). A
 regression over the motions that the delay pairs then gives the Jacobian.
@@ -56,6 +60,11 @@ MIN_CHANGE_RATIO: Final = 0.8  # [1]
 # A model error below this share of the noise cannot favour a wrong delay, so that a steady motion counts as well.
 MAX_BIAS_RATIO: Final = 0.25  # [1]
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
+MAX_LATENESS: Final = (
+    1.0  # [s] a change of the age of frames beyond it is one of the camera's clock
+)
+# [s] by which the age that counts as not late follows that of a frame: 200 ppm of the least duration of a motion
+DRIFT_STEP: Final = 1e-5
 DOUBT_GATE: Final = 100.0  # [1] g
 # A doubtful frame was false if ‖ν‖² of the motion past it is below this share of the ‖ν‖² of the motion to it.
 TAKE_BACK_RATIO: Final = 0.5  # [1]
@@ -106,13 +115,22 @@ class Candidates:
         count = 1 + math.floor(whole_periods(longest, period) / spacing)
         return cls(np.asarray(spacing * np.arange(count), dtype=np.float64))
 
-    def ends(self, past: FloatArray) -> FloatArray:
-        """Return the past (..., H, columns) at each delay, (..., D, columns)."""
+    def ends(self, past: FloatArray, late: FloatArray | None = None) -> FloatArray:
+        """Return the past (..., H, columns) at each delay, (..., D, columns), and `late` (...) periods before."""
+        if late is not None:
+            return at(past, self.delays + late[..., None])
         rows = [past[..., self._whole + i, :] for i in range(len(self._weights))]
         return weighted(self._weights, rows)
 
-    def begins(self, past: FloatArray, periods: FloatArray) -> FloatArray:
-        """Return the past (..., H, columns) at each delay and about `periods` (...) before, (..., D, columns)."""
+    def begins(
+        self, past: FloatArray, periods: FloatArray, late: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the past (..., H, columns) at each delay and about `periods` (...) before, (..., D, columns).
+
+        With `late` (...) [periods] it is so much before, exactly.
+        """
+        if late is not None:
+            return at(past, self.delays + (periods + late)[..., None])
         first = self._whole + np.rint(periods).astype(np.int_)[..., None]
         rows = [pick(past, first + i, axes=1) for i in range(len(self._weights))]
         return weighted(self._weights, rows)
@@ -130,13 +148,44 @@ def interpolation_weights(c: FloatArray) -> FloatArray:
     """Return the weights of x_w, x_{w+1} and x_{w+2}, (3, D), at shares c (D,) of a period; (1, D) if all c are 0."""
     if not c.any():
         return np.ones((1, len(c)))
+    return parabola(c)
+
+
+def parabola(c: FloatArray) -> FloatArray:
+    """Return the weights of x_w, x_{w+1} and x_{w+2}, (3, ...), at shares c (...) of a period."""
     bend = -0.5 * c * (1.0 - c)
     return np.stack([1.0 - c + bend, c - 2.0 * bend, bend])
+
+
+def at(past: FloatArray, ago: FloatArray) -> FloatArray:
+    """Return the past (..., H, columns) at any times `ago` (..., K) [periods], (..., K, columns)."""
+    oldest = past.shape[-2] - 3
+    periods = np.clip(ago, 0.0, oldest)
+    whole = periods.astype(np.int_)
+    weights = parabola(periods - whole)[..., None]
+    return weighted(weights, [pick(past, whole + i, axes=1) for i in range(len(weights))])
 
 
 def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> FloatArray:
     """Return Σ_i w_i x_i."""
     return reduce(operator.add, map(operator.mul, weights, rows))
+
+
+class Lateness(NamedTuple):
+    """How late frames are, by their stamps."""
+
+    age: FloatArray  # (...) [s] by its stamp, of a frame that is not late; NaN before there is one
+    last: FloatArray  # (...) [s], of the last frame; 0 where it is not known
+
+    def next(self, age: FloatArray) -> Self:
+        """Return the state after a frame whose age by its stamp is `age` (...) [s], NaN without one."""
+        late = age - self.age
+        known = np.abs(late) < MAX_LATENESS
+        followed = self.age + np.clip(late, -DRIFT_STEP, DRIFT_STEP)
+        anew = np.where(np.isnan(age), self.age, age)
+        return type(self)(
+            age=np.where(known, followed, anew)[()], last=np.where(known, late, 0.0)[()]
+        )
 
 
 class Identified(NamedTuple):
@@ -156,12 +205,15 @@ class Anchor(NamedTuple):
     duration: FloatArray  # (...), s
     valid: BoolArray  # (..., m), features that were measured at both ends
     miss: FloatArray  # min_d ‖ν_d‖², (...), of the last frame; 0 where it is the anchor
+    late: FloatArray | None  # (...) [s]; None without stamps
 
     @classmethod
-    def at_last_frame(cls, known: Identified, features: int) -> Self:
+    def at_last_frame(cls, known: Identified, features: int, late: FloatArray | None) -> Self:
         """Return the anchor at a frame that is believed, since which no motion ended; `features` is m."""
         none = np.zeros((*np.shape(known.candidate), features))
-        return cls(known, step=none, duration=none[..., 0], valid=none == 0.0, miss=none[..., 0])
+        return cls(
+            known, step=none, duration=none[..., 0], valid=none == 0.0, miss=none[..., 0], late=late
+        )
 
 
 class PairState(NamedTuple):
@@ -176,11 +228,27 @@ class PairState(NamedTuple):
     nis: FloatArray  # ‖ν‖²/s of the last motion per feature, (...)
     regression: RegressionState  # over the paired motions
     anchor: Anchor  # from which false frames are found
+    lateness: Lateness | None  # None without stamps
+
+    @property
+    def late(self) -> FloatArray | None:
+        """Lateness of the last frame, (...) [s]; None without stamps."""
+        if self.lateness is None:
+            return None
+        return self.lateness.last
+
+    def after(self, observation: Observation) -> Self:
+        """Return the state with the lateness of the frame of an observation."""
+        if self.lateness is None:
+            return self
+        age = observation.time - np.asarray(observation.capture_time)
+        return self._replace(lateness=self.lateness.next(age))
 
     def anchored(self) -> Self:
         """Return the state with its last frame as the anchor."""
         known = Identified(self.bank, self.scores, self.candidate, self.regression)
-        return self._replace(anchor=Anchor.at_last_frame(known, self.base.shape[-2]))
+        anchor = Anchor.at_last_frame(known, self.base.shape[-2], self.late)
+        return self._replace(anchor=anchor)
 
 
 class FeatureMotion(NamedTuple):
@@ -205,6 +273,14 @@ class Paired(NamedTuple):
     back: BoolArray  # (...), whether a false frame was taken back
 
 
+class LateFrame(NamedTuple):
+    """The motion from the exposure of a late frame to that of one that is not."""
+
+    begin: FloatArray  # (..., n) [rad]
+    joint_step: FloatArray  # (..., n) [rad]
+    predicted: FloatArray  # J_n Δq, (..., m), along it
+
+
 class Past(NamedTuple):
     """The past motion that the predict stage needs."""
 
@@ -215,6 +291,7 @@ class Past(NamedTuple):
     # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
     window: FloatArray
     noise: FloatArray  # e, (..., m), of the last frame from which was learned.
+    late: LateFrame | None  # of the present frame; None without stamps
 
 
 @final
@@ -259,7 +336,13 @@ class Pairing:
         frame = self._aids.feature_noise**2
         no_motion = np.zeros((*lead, m))
         row = np.concatenate([q, no_motion], axis=-1)
-        past = np.repeat(row[..., None, :], self._rows, axis=-2)
+        lateness = None
+        count = self._rows
+        if np.isfinite(observation.capture_time).any():
+            never = np.full(lead, np.nan)[()]
+            lateness = Lateness(never, np.zeros(lead)[()])
+            count += whole_periods(MAX_LATENESS, self._period)
+        past = np.repeat(row[..., None, :], count, axis=-2)
         nominal_map = np.eye(m, m + self._n)
         bank = fresh_bank(nominal_map, self._variances, frame)
         count = len(self.delays)
@@ -270,9 +353,12 @@ class Pairing:
             regression=self.regression.start(lead, frame),
         )
         noise = NoiseLevel.start(self._aids.feature_noise, lead)
-        anchor = Anchor.at_last_frame(known, m)
+        anchor = Anchor.at_last_frame(known, m, None if lateness is None else lateness.last)
         nis = np.zeros(lead)[()]
-        return PairState(past, base, noise=noise, nis=nis, anchor=anchor, **known._asdict())
+        start = PairState(
+            past, base, noise=noise, nis=nis, anchor=anchor, lateness=lateness, **known._asdict()
+        )
+        return start.after(observation)
 
     def advance(self, state: PairState, joint_position: FloatArray, base: FloatArray) -> PairState:
         """Return the state one period later, with the arm at `joint_position` (..., n), rad, and J_n there."""
@@ -291,17 +377,37 @@ class Pairing:
         """Return d, (...), periods."""
         return np.asarray(np.take(self.delays, state.candidate))[()]
 
-    def past(self, state: PairState, joint_position: FloatArray, window: int) -> Past:
-        """Return the past of an arm that is at `joint_position` (..., n), rad; `window` in periods."""
+    def past(self, state: PairState, observation: Observation, window: int) -> Past:
+        """Return the past of an arm as it is observed; `window` in periods."""
         n = self._n
         rows = self._candidates.exposed(state.past, state.candidate)
         exposed = rows[..., 0, :]
         before = exposed - rows[..., 1, :]
         since = state.past[..., 0, :] - exposed
         predicted = (before[..., n:], since[..., n:])
-        step = joint_position - state.past[..., window, :n]
+        step = observation.joint_position - state.past[..., window, :n]
         noise = state.regression.mean[..., -1]
-        return Past(exposed[..., :n], before[..., :n], predicted, step, noise)
+        late = self._late_frame(state, observation, exposed)
+        return Past(exposed[..., :n], before[..., :n], predicted, step, noise, late)
+
+    def _late_frame(
+        self, state: PairState, observation: Observation, exposed: FloatArray
+    ) -> LateFrame | None:
+        """Return the motion to the row of the past (..., n + m) that a frame shows that is not late."""
+        # Between frames the last one becomes older.
+        late = self._in_periods(state.after(observation).late)
+        if late is None:
+            return None
+        n = self._n
+        ago = self.delay(state) + late
+        begin = at(state.past, ago[..., None])[..., 0, :]
+        passed = exposed - begin
+        return LateFrame(begin[..., :n], passed[..., :n], passed[..., n:])
+
+    def _in_periods(self, late: FloatArray | None) -> FloatArray | None:
+        if late is None:
+            return None
+        return late / self._period
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""
@@ -310,7 +416,12 @@ class Pairing:
         return state.noise.deviation
 
     def learn(
-        self, state: PairState, feature_step: FloatArray, duration: FloatArray, valid: BoolArray
+        self,
+        state: PairState,
+        feature_step: FloatArray,
+        duration: FloatArray,
+        valid: BoolArray,
+        observation: Observation,
     ) -> tuple[PairState, Paired]:
         """Return the state after a motion of the feature, and the joint motion that belongs to it.
 
@@ -320,7 +431,10 @@ class Pairing:
             duration: that it took, (...), s, at most `gap` periods.
             valid: features that were measured at both ends, (..., m); others are taken to move as foreseen, the noise
                 of their last frame included.
+            observation: at which the motion ended.
         """
+        late_before = self._in_periods(state.late)
+        state = state.after(observation)
         motion = FeatureMotion(feature_step, duration, valid)
         anchor = state.anchor
         since = anchor._replace(
@@ -328,9 +442,10 @@ class Pairing:
             duration=anchor.duration + duration,
             valid=anchor.valid & valid,
         )
-        end = self._candidates.ends(state.past)
+        end = self._candidates.ends(state.past, self._in_periods(state.late))
         periods_since = since.duration / self._period
-        begin_since = self._candidates.begins(state.past, periods_since)
+        late_since = self._in_periods(anchor.late)
+        begin_since = self._candidates.begins(state.past, periods_since, late_since)
 
         # A frame is taken back if the motion past it, from the anchor, fits much better than the motion to it. Its miss
         # is that of the delay that was known at the anchor.
@@ -346,7 +461,7 @@ class Pairing:
         # Where the anchor is the last frame, the motion since the anchor is the last motion, and its begin is known.
         shorter = (anchor.miss > 0.0) & ~back
         periods = duration / self._period
-        begin = branch(shorter, self._begins_instead, begin_since, state.past, periods)
+        begin = branch(shorter, self._begins_instead, begin_since, state.past, periods, late_before)
         state, paired = self._learned(state, motion, begin, end, back)
         state = state.anchored()
 
@@ -395,8 +510,10 @@ class Pairing:
         state = branch(moved, self._forget, state._replace(regression=regression))
         return state, paired
 
-    def _begins_instead(self, _: FloatArray, past: FloatArray, periods: FloatArray) -> FloatArray:
-        return self._candidates.begins(past, periods)
+    def _begins_instead(
+        self, _: FloatArray, past: FloatArray, periods: FloatArray, late: FloatArray | None
+    ) -> FloatArray:
+        return self._candidates.begins(past, periods, late)
 
     def _least_miss_instead(
         self, _: FloatArray, since: Anchor, begin: FloatArray, end: FloatArray
@@ -421,8 +538,9 @@ class Pairing:
         square = np.vecdot(nu, nu)
         return np.asarray(np.minimum.reduce(square, axis=-1))
 
-    def interrupt(self, state: PairState) -> PairState:
+    def interrupt(self, state: PairState, observation: Observation) -> PairState:
         """Return the state after a frame at which no motion ended, without information about its noise."""
+        state = state.after(observation)
         frame = state.noise.variance
         regression = self.regression.interrupt(state.regression, frame)
         return state._replace(bank=interrupted(state.bank, frame), regression=regression).anchored()

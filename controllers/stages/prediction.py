@@ -274,7 +274,7 @@ class Predictor:
         if stages.pairing is None:
             raise ValueError("aids: a stage that predicts needs the pair stage")
         q = observation.joint_position
-        past = stages.pairing.past(estimation.learned.pair, q, self.window)
+        past = stages.pairing.past(estimation.learned.pair, observation, self.window)
 
         # The joint positions that the arm is bound to reach, and when.
         response = state.response
@@ -287,8 +287,11 @@ class Predictor:
             lead = response.lead
 
         z = observation.feature
+        if past.late is not None:
+            # What the frame would show if it were not late.
+            z = z + stages.motion(estimation, *past.late)
         if self._aids.filter:
-            z = self._filtered(state, stages, estimation, observation, past)
+            z = self._filtered(state, stages, estimation, observation, z, past)
 
         # From the exposure the arm moved to q, and will move on to `bound`, along which J_n is the mean of both ends.
         J, nominal = stages.ahead(estimation, bound)
@@ -304,18 +307,19 @@ class Predictor:
         stages: Estimation,
         estimation: EstimationState,
         observation: Observation,
+        frame: FloatArray,
         past: Past,
     ) -> FloatArray:
-        """Return z, (..., m): features without their noise, and expected ones where no frame was learned from."""
+        """Return z, (..., m): a frame without its noise, and what is expected where no frame was learned from."""
         begin = past.exposed - past.before
         expected = state.feature + stages.motion(estimation, begin, past.before, past.predicted[0])
         noise = past.noise
         learned = np.equal(estimation.last.time, observation.time)
         if self._share is not None:
-            noise = self._share * (observation.feature - expected)
+            noise = self._share * (frame - expected)
             learned = np.full_like(learned, fill_value=True)
         believed = learned[..., None] & observation.valid
-        return np.where(believed, observation.feature - noise, expected)
+        return np.where(believed, frame - noise, expected)
 
     def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
         """Return the state after the joint step (..., n), rad, left the chain."""

@@ -94,3 +94,18 @@ def test_the_posture_moves_the_arm_at_rest_without_spoiling_the_jacobian(name, s
     request = RunRequest("kinematic", name, "random", "moderate", seed, sensing=sensing)
     error = run_experiment(request, read_settings(None, [])).steps["jacobian_error"].to_numpy()
     assert error[-1] < 1.2 * error[20] < 0.3
+
+
+@pytest.mark.parametrize(
+    ("task", "mismatch"), [("random", "latency_swing=200ms"), ("circle", "jitter=200ms")]
+)
+def test_with_stamps_a_changing_latency_leaves_a_fraction_of_the_error(task, mismatch):
+    """The delay bank of the pair stage finds what remains constant: latency and offset of the camera's clock."""
+    seeds = (3, 4)
+    late = rows(PLUS, task, f"moderate+{mismatch}", seeds)
+    clock = ("kinematic.sensing.stamps=true", "kinematic.sensing.clock_offset=1e3")
+    stamped = rows(PLUS, task, f"moderate+{mismatch}", seeds, *clock)
+    for before, after in zip(late, stamped, strict=True):
+        assert after["steady_state_error"] < 0.002
+        assert after["steady_state_error"] < 0.5 * before["steady_state_error"]
+        assert after["rms_error"] < before["rms_error"]

@@ -7,13 +7,25 @@ import pytest
 from scipy.interpolate import BarycentricInterpolator
 from scipy.stats import multivariate_normal
 
-from kit.toy import KNOWLEDGE, NETWORK, PERIOD, SPEC, TURN, M, N, late_features, path, seen
+from kit.toy import (
+    KNOWLEDGE,
+    NETWORK,
+    PERIOD,
+    SPEC,
+    TURN,
+    M,
+    N,
+    assert_lanes,
+    late_features,
+    path,
+    seen,
+)
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages import pairing
 from servobench.controllers.stages.estimation import Estimation
-from servobench.plant.contract.signals import Observation
+from servobench.plant.contract.signals import Observation, trusted_observation
 
 MAPPED = {"delay": "identified", "noise": "identified", "model": "regression"}
 
@@ -35,8 +47,8 @@ class Following:
             ConstantEstimator(), knowledge, AidsConfig(**{**MAPPED, **aids}), delays
         )
 
-    def see(self, q, y, valid=True):
-        look = Observation(self.k * self.period, q, y, valid)
+    def see(self, q, y, valid=True, captured=np.nan):
+        look = self.last = Observation(self.k * self.period, q, y, valid, capture_time=captured)
         if self.state is None:
             self.state = self.stages.start(look, NETWORK.jacobian(q))
         self.state = self.stages.update(self.state, look, np.zeros(M))
@@ -92,7 +104,7 @@ def test_a_given_delay_is_used_as_it_is(latency):
     q = path(1.0)
     made.follow(q, late_features(q, TURN, 4))
     assert made.found["delay"] == pytest.approx(latency)
-    exposed, before, moved, *_ = made.stages.pairing.past(made.pair, q[-1], 1)
+    exposed, before, moved, *_ = made.stages.pairing.past(made.pair, made.last, 1)
     at = len(q) - 1 - latency / PERIOD
     newest = int(np.ceil(round(at, 9)))  # of the three rows of a parabola
     wanted = []
@@ -317,8 +329,101 @@ def test_given_noise_is_not_identified():
     J = np.ones((M, N))
     first = stage.start(seen(np.zeros(N), np.zeros(M)), J)
     state = stage.advance(first, q, J)
-    after, paired = stage.learn(state, np.full(M, 0.06), np.float64(PERIOD), np.full(M, True))
+    look = seen(q, np.full(M, 0.06))
+    after, paired = stage.learn(state, np.full(M, 0.06), np.float64(PERIOD), np.full(M, True), look)
     np.testing.assert_array_equal(after.noise.variance, state.noise.variance)
     assert stage.noise(state) is None
     np.testing.assert_allclose(paired.joint_step, 0.01)
     np.testing.assert_allclose(paired.predicted, 0.05)
+
+
+PARTS = 25  # of a period, of which the lateness of frames is a multiple
+
+
+def late_run(parts, *, stamps, offset=50.0, **aids):
+    """Return stages that followed an arm whose frames are late by so many parts (k,), and its fine path."""
+    count = len(parts)
+    fine = path(count * PERIOD, PERIOD / PARTS)
+    features = late_features(fine, TURN)
+    made = Following(**aids)
+    for k in range(count):
+        exposed = PARTS * k - parts[k]
+        captured = exposed * PERIOD / PARTS + offset if stamps else np.nan
+        made.see(fine[PARTS * k], features[max(exposed, 0)], captured=captured)
+    return made, fine
+
+
+def jittering(count, seed=2):
+    """Return parts of a period by which frames are late: two periods, and up to four more."""
+    parts = np.random.default_rng(seed).integers(2 * PARTS, 6 * PARTS, count)
+    parts[0] = 2 * PARTS
+    return parts
+
+
+def test_with_stamps_the_joints_at_the_exposure_are_found_however_the_latency_jitters(monkeypatch):
+    """Those between two periods are those of a parabola, exactly."""
+    monkeypatch.setattr(pairing, "DRIFT_STEP", 0.0)
+    parts = jittering(40)
+    made, fine = late_run(parts, stamps=True, delay="given", latency=2 * PERIOD)
+    late = made.stages.pairing.past(made.pair, made.last, 1).late
+    at = 39 - parts[-1] / PARTS
+    rows = int(np.ceil(at)) - np.arange(3)
+    wanted = BarycentricInterpolator(rows, fine[PARTS * rows])(at)
+    np.testing.assert_allclose(late.begin, wanted, atol=1e-12)
+    np.testing.assert_allclose(wanted, fine[round(PARTS * at)], atol=2e-3)
+    np.testing.assert_allclose(late.begin + late.joint_step, fine[37 * PARTS], atol=1e-12)
+    # The last motion is paired with that between the exposures of its frames.
+    end = made.stages.pairing._candidates.ends(made.pair.past, made.pair.late / PERIOD)
+    np.testing.assert_allclose(end[0, :N], wanted, atol=1e-12)
+
+
+def test_with_stamps_a_jittering_latency_does_no_harm_whatever_the_clock_shows():
+    parts = jittering(80)
+    errors = []
+    for stamps, offset in ((False, 0.0), (True, 0.0), (True, -1e4)):
+        made, fine = late_run(parts, stamps=stamps, offset=offset, longest_delay=0.4)
+        errors.append(made.error(TURN @ NETWORK.jacobian(fine[79 * PARTS])))
+    assert errors[1] < 0.1
+    assert errors[1] < 0.3 * errors[0]
+    assert errors[2] == pytest.approx(errors[1], rel=1e-3)
+    # The delay is the latency of the first frame.
+    assert made.found["delay"] == pytest.approx(2 * PERIOD, abs=1.01 * pairing.RESOLUTION)
+
+
+def test_a_clock_that_drifts_is_followed_and_one_that_is_set_begins_anew():
+    late = pairing.Lateness(np.float64(np.nan), np.float64(0.0)).next(np.float64(7.0))
+    assert (late.age, late.last) == (7.0, 0.0)
+    assert late.next(np.float64(7.2)).last == pytest.approx(0.2)
+    drifting = late
+    for k in range(1000):
+        drifting = drifting.next(np.float64(7.0 + 0.9 * pairing.DRIFT_STEP * k))
+    assert drifting.last == pytest.approx(0.0, abs=pairing.DRIFT_STEP)
+    gap = late.next(np.float64(np.nan))
+    assert (gap.age, gap.last) == (7.0, 0.0)
+    anew = late.next(np.float64(3600.0))
+    assert (anew.age, anew.last) == (3600.0, 0.0)
+
+
+def test_stages_with_stamps_have_the_same_bits_in_lanes():
+    lateness = 0.1 + 0.15 * np.random.default_rng(3).random((3, 30))
+    q = np.stack([path(1.5, seed=1 + lane)[:30] for lane in range(3)])
+    y = np.stack([late_features(q[lane], TURN, 2) for lane in range(3)])
+
+    def run(lanes):
+        made = Following()
+        for k in range(30):
+            valid = np.ones((*np.shape(lanes), M), dtype=np.bool_)
+            look = trusted_observation(
+                k * PERIOD,
+                q[lanes, k],
+                y[lanes, k],
+                valid.all(axis=-1),
+                valid,
+                k * PERIOD - lateness[lanes, k],
+            )
+            if made.state is None:
+                made.state = made.stages.start(look, NETWORK.jacobian(q[lanes, 0]))
+            made.state = made.stages.update(made.state, look, np.zeros(M))
+        return {"J": made.state.jacobian, "delay": made.found["delay"]}
+
+    assert_lanes(run)

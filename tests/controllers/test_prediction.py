@@ -168,7 +168,9 @@ def at(q):
 EXPOSED = np.array([0.5, -0.3])
 BEFORE = np.array([0.1, 0.2])
 NOW = np.array([0.9, 0.4])
-MOVING = Past(EXPOSED, BEFORE, (np.zeros(2), np.zeros(2)), np.zeros(2), np.array([0.03, -0.02]))
+MOVING = Past(
+    EXPOSED, BEFORE, (np.zeros(2), np.zeros(2)), np.zeros(2), np.array([0.03, -0.02]), None
+)
 
 
 def test_the_noise_of_its_frame_is_taken_from_a_feature_that_was_learned_from():
