@@ -245,7 +245,7 @@ class Servo:
             pairing.delay(pair) * self.knowledge.spec.period,
             pair.noise.deviation,
         )
-        return self.calibration.update(state.calibration, observation, due, regression)
+        return self.calibration.update(state.calibration, observation, due, regression, pair.late)
 
     def _believed(
         self,

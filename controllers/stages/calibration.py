@@ -13,6 +13,7 @@ import numpy as np
 
 from servobench.controllers.choice import choose
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.arm_fit import (
     FLOOR,
     FRAMES,
@@ -26,6 +27,7 @@ from servobench.controllers.stages.arm_fit import (
     first,
     whitened,
 )
+from servobench.controllers.stages.pairing import MAX_LATENESS, rows_ago
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
@@ -113,6 +115,7 @@ class Calibration:
         self._period = knowledge.spec.period
         self._m = knowledge.spec.m
         self.fit = Fit(model, knowledge.unit, self._period)
+        self._periods = 1 + (self.fit.rows - 1) * self.fit.stride
 
     def start(self, observation: Observation) -> CalibrationState:
         """Return the state before any frame."""
@@ -130,7 +133,9 @@ class Calibration:
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
         members = fit.spawned(lead, zero, MANY, none)
         size = (*lead, MANY)
-        periods = 1 + (fit.rows - 1) * fit.stride
+        periods = self._periods
+        if np.isfinite(observation.capture_time).any():
+            periods += whole_periods(MAX_LATENESS, self._period)
         history = np.broadcast_to(q[..., None, :], (*lead, periods, n))
         return CalibrationState(
             begin=float(observation.time),
@@ -160,6 +165,7 @@ class Calibration:
         observation: Observation,
         due: BoolArray,
         regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        late: FloatArray | None = None,
     ) -> CalibrationState:
         """Return the state at an observation.
 
@@ -168,6 +174,7 @@ class Calibration:
             observation: of this period.
             due: whether its frame is learned from, (...).
             regression: its feature without noise (..., m), Jacobian (..., m, n), delay (...) [s] and noise σ (...).
+            late: by which the frame is known to be later than others, (...) [s]; None where nothing is known.
         """
         q = observation.joint_position
         step = q - state.history[..., 0, :]
@@ -181,7 +188,7 @@ class Calibration:
                 state = self._reduced(state, size)
         past = state.past
         state = branch(
-            due, self._learn, state._replace(past=()), observation, regression, past, elapsed
+            due, self._learn, state._replace(past=()), observation, regression, past, elapsed, late
         )
         return state._replace(past=self._remembered(past, state, due, regression))
 
@@ -192,22 +199,26 @@ class Calibration:
         regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
         past: tuple[Known, ...],
         elapsed: float,
+        late: FloatArray | None,
     ) -> CalibrationState:
         """Return the state after a frame."""
-        fit = self.fit
         _, _, delay, deviation = regression
-        path = state.history[..., :: fit.stride, :][..., ::-1, :]
+        path = self._path(state.history, late)
         lead = state.travel.shape
         time = np.full(lead, elapsed)[()]
+        instant = time
+        if late is not None:
+            # Time and path are those at which it would have come if it were not late.
+            instant = time - late
         y = observation.feature
-        frames = added(state.frames, time, y, observation.valid, path)
+        frames = added(state.frames, instant, y, observation.valid, path)
         noise = np.clip(deviation, *NOISE)
         known = (state.lateness > 0.0) & (state.across > 0.0)
         across = np.minimum(np.maximum(state.across, NOISE[0]), noise)
         noise = np.where(known, across, noise)
         state = state._replace(frames=frames, noise=noise)
         if past:
-            state = self._judged(state, y, path, elapsed, delay, past)
+            state = self._judged(state, y, path, instant, delay, past)
         many = frames.number >= MANY_FRAMES
         level = np.where(
             many & state.fitted, np.minimum(noise, EXPLAINED * state.rms + 0.2e-3), noise
@@ -224,6 +235,14 @@ class Calibration:
         lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
         new = lost & (time - state.tried > TRIAL_TIME) & (time < LAST_TRIAL)
         return branch(new, self._tried, state._replace(used=used), elapsed, delay, level)
+
+    def _path(self, history: FloatArray, late: FloatArray | None) -> FloatArray:
+        """Return joint positions up to `late` (...) [s] ago, (..., J, n), the newest last."""
+        stride = self.fit.stride
+        if late is None:
+            return history[..., : self._periods : stride, :][..., ::-1, :]
+        ago = late[..., None] / self._period + stride * np.arange(self.fit.rows)
+        return rows_ago(history, ago)[..., ::-1, :]
 
     def _in_use(self, state: CalibrationState, elapsed: float) -> Frames:
         """Return the frames, without rows for which there were too few periods so far."""
@@ -345,7 +364,7 @@ class Calibration:
         state: CalibrationState,
         y: FloatArray,
         path: FloatArray,
-        elapsed: float,
+        instant: FloatArray,
         delay: FloatArray,
         past: tuple[Known, ...],
     ) -> CalibrationState:
@@ -354,7 +373,7 @@ class Calibration:
         fit = self.fit
         members = known.members
         q, _ = at_latency(path[..., None, :, :], members.latency, fit.grid)
-        turn = (members.turning * elapsed)[..., None]
+        turn = (members.turning * instant[..., None])[..., None]
         found = fit.model.feature(members.theta, members.cameras, q, turn)
         seen = found[..., 0, :] / fit.scale
         by_arm = np.vecmat(known.share, seen + known.bias)
@@ -426,7 +445,7 @@ class Calibration:
     ) -> tuple[Known, ...]:
         """Return what is known at the last frames, with this one where it is due."""
         feature, jacobian, delay, _ = regression
-        path = state.history[..., :: self.fit.stride, :][..., ::-1, :]
+        path = self._path(state.history, None)
         exposed, _ = at_latency(path[..., None, :, :], delay[..., None], self.fit.grid)
         new = Known(
             state.members,

@@ -118,7 +118,7 @@ class Candidates:
     def ends(self, past: FloatArray, late: FloatArray | None = None) -> FloatArray:
         """Return the past (..., H, columns) at each delay, (..., D, columns), and `late` (...) periods before."""
         if late is not None:
-            return at(past, self.delays + late[..., None])
+            return rows_ago(past, self.delays + late[..., None])
         rows = [past[..., self._whole + i, :] for i in range(len(self._weights))]
         return weighted(self._weights, rows)
 
@@ -130,7 +130,7 @@ class Candidates:
         With `late` (...) [periods] it is so much before, exactly.
         """
         if late is not None:
-            return at(past, self.delays + (periods + late)[..., None])
+            return rows_ago(past, self.delays + (periods + late)[..., None])
         first = self._whole + np.rint(periods).astype(np.int_)[..., None]
         rows = [pick(past, first + i, axes=1) for i in range(len(self._weights))]
         return weighted(self._weights, rows)
@@ -157,7 +157,7 @@ def parabola(c: FloatArray) -> FloatArray:
     return np.stack([1.0 - c + bend, c - 2.0 * bend, bend])
 
 
-def at(past: FloatArray, ago: FloatArray) -> FloatArray:
+def rows_ago(past: FloatArray, ago: FloatArray) -> FloatArray:
     """Return the past (..., H, columns) at any times `ago` (..., K) [periods], (..., K, columns)."""
     oldest = past.shape[-2] - 3
     periods = np.clip(ago, 0.0, oldest)
@@ -174,8 +174,8 @@ def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> Float
 class Lateness(NamedTuple):
     """How late frames are, by their stamps."""
 
-    age: FloatArray  # (...) [s] by its stamp, of a frame that is not late; NaN before there is one
-    last: FloatArray  # (...) [s], of the last frame; 0 where it is not known
+    age: FloatArray  # (...) [s] that counts as not late, by the stamps; NaN before there is one
+    last: FloatArray  # (...) [s] lateness of the last frame; 0 where it is not known
 
     def next(self, age: FloatArray) -> Self:
         """Return the state after a frame whose age by its stamp is `age` (...) [s], NaN without one."""
@@ -337,10 +337,12 @@ class Pairing:
         no_motion = np.zeros((*lead, m))
         row = np.concatenate([q, no_motion], axis=-1)
         lateness = None
+        late: FloatArray | None = None
         count = self._rows
         if np.isfinite(observation.capture_time).any():
             never = np.full(lead, np.nan)[()]
-            lateness = Lateness(never, np.zeros(lead)[()])
+            late = np.zeros(lead)[()]
+            lateness = Lateness(never, late)
             count += whole_periods(MAX_LATENESS, self._period)
         past = np.repeat(row[..., None, :], count, axis=-2)
         nominal_map = np.eye(m, m + self._n)
@@ -353,7 +355,7 @@ class Pairing:
             regression=self.regression.start(lead, frame),
         )
         noise = NoiseLevel.start(self._aids.feature_noise, lead)
-        anchor = Anchor.at_last_frame(known, m, None if lateness is None else lateness.last)
+        anchor = Anchor.at_last_frame(known, m, late)
         nis = np.zeros(lead)[()]
         start = PairState(
             past, base, noise=noise, nis=nis, anchor=anchor, lateness=lateness, **known._asdict()
@@ -400,7 +402,7 @@ class Pairing:
             return None
         n = self._n
         ago = self.delay(state) + late
-        begin = at(state.past, ago[..., None])[..., 0, :]
+        begin = rows_ago(state.past, ago[..., None])[..., 0, :]
         passed = exposed - begin
         return LateFrame(begin[..., :n], passed[..., :n], passed[..., n:])
 

@@ -220,7 +220,9 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     truth = mapping.truth
     home = () if mapping.home is None else (mapping.home,)
     camera = mapping.camera or ()
-    captured = () if mapping.captured is None else (mapping.captured,)
+    captured: Names = ()
+    if mapping.captured is not None:
+        captured = (mapping.captured,)
     unit = mapping.names.feature_unit
     # Role, names, number of values, unit.
     roles = (

@@ -47,13 +47,32 @@ def test_the_latency_of_frames_is_found():
     assert steps["diagnostic_calibration_latency"].iloc[-1] == pytest.approx(0.1, abs=0.01)
 
 
-def test_runs_side_by_side_have_the_bits_of_each_run_alone():
+@pytest.mark.parametrize("stamps", [{}, {"stamps": True, "jitter": 0.1}])
+def test_runs_side_by_side_have_the_bits_of_each_run_alone(stamps):
     rough = {
-        "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}},
+        "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05, **stamps}},
         "random": {"duration": 1.5},
     }
     runs = [run("severe", seed, settings=rough, task="random") for seed in (40001, 40002, 40003)]
     assert_rows_of_single_runs(runs)
+
+
+def test_with_stamps_the_latency_of_frames_is_found_though_it_swings():
+    swing = {"latency": 0.05, "latency_swing": 0.1, "swing_period": 1.0}
+    found = []
+    for stamps in (False, True):
+        settings = {
+            "kinematic": {"sensing": {**swing, "stamps": stamps, "clock_offset": 40.0}},
+            "random": {"duration": 4.0},
+            **CALIBRATING,
+        }
+        found.append(carry_out(run("moderate", settings=settings, task="random")).steps.iloc[-1])
+    bare, stamped = found
+    assert bare["diagnostic_lateness"] > 0.02
+    assert stamped["diagnostic_lateness"] == 0.0
+    # That of the first frame, which does not swing yet.
+    assert stamped["diagnostic_calibration_latency"] == pytest.approx(0.05, abs=0.01)
+    assert stamped["diagnostic_calibration_rms"] < bare["diagnostic_calibration_rms"]
 
 
 @pytest.mark.parametrize("sensing", ["pixel", "stereo", "plate", "pixel:hand"])
