@@ -25,7 +25,7 @@ class LoggedPlant(Plant):
         Args:
             spec: names, units and period.
             table: a row a control period, with columns as `steps.parquet` has them; times do not count, and
-                `feature_valid` and `true_feature_…` may be missing.
+                `feature_valid`, `capture_time_s` and `true_feature_…` may be missing.
 
         Raises:
             ConfigurationError: a column or a number is missing.
@@ -36,6 +36,7 @@ class LoggedPlant(Plant):
         self.reference = numbers_of(LOG, table, column_names(spec)["reference"])
         if not self.log.valid.any():
             raise ConfigurationError("the log has no row whose feature_valid is 1 or true")
+        self._captured = table.reindex(columns=["capture_time_s"]).to_numpy(np.float64)[:, 0]
         self._true = table.reindex(columns=column_names(spec)["true_feature"]).to_numpy(np.float64)
 
     def reset(self, seed: int) -> Observation:
@@ -52,7 +53,13 @@ class LoggedPlant(Plant):
         k = self._k
         log = self.log
         time = k * self.spec.period
-        return Observation(time, log.joints[k], log.features[k], bool(log.valid[k]))
+        return Observation(
+            time,
+            log.joints[k],
+            log.features[k],
+            bool(log.valid[k]),
+            capture_time=self._captured[k],
+        )
 
     def truth(self) -> Truth:
         """Return the true feature of the log, NaN where it has none."""

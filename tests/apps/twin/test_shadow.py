@@ -77,6 +77,19 @@ def test_a_run_shown_to_its_own_controller_gives_its_commands_to_the_bit(folder,
     assert not seen["feature_valid"].all()
 
 
+def test_a_run_with_stamped_frames_is_shown_with_them(tmp_path):
+    sensing = {"latency": 0.05, "jitter": 0.1, "stamps": True, "clock_offset": 9.0}
+    settings = {"kinematic": {"sensing": sensing}, "random": {"duration": 2.0}}
+    out = tmp_path / "runs"
+    compare(["regression_mfac"], tasks=["random"], seeds=[3], settings=settings, out=out)
+    selected = logged_in_folder(ResultsFolder(out), None, None)
+    steps = selected[1]
+    assert np.ptp(steps["time_s"] + 9.0 - steps["capture_time_s"]) > 0.05
+    seen = shadow(*selected)
+    np.testing.assert_array_equal(seen["capture_time_s"], steps["capture_time_s"])
+    np.testing.assert_array_equal(commands(seen), commands(steps))
+
+
 def test_settings_without_a_limit_are_read_from_a_folder(tmp_path):
     compare(
         ["ukf_mpc"],
