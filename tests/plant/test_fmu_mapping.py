@@ -83,7 +83,7 @@ def test_every_key_arrives(tmp_path):
         (
             'home = "q0"',
             'hoem = "q0"',
-            r"no setting 'hoem': did you mean 'home'\? valid: camera, debug_log, features",
+            r"no setting 'hoem': did you mean 'home'\? valid: camera, captured, debug_log, features",
         ),
         (
             "mass = 12",
