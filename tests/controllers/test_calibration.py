@@ -64,7 +64,6 @@ def test_with_stamps_the_latency_of_frames_is_found_though_it_swings():
         settings = {
             "kinematic": {"sensing": {**swing, "stamps": stamps, "clock_offset": 40.0}},
             "random": {"duration": 4.0},
-            **CALIBRATING,
         }
         found.append(carry_out(run("moderate", settings=settings, task="random")).steps.iloc[-1])
     bare, stamped = found

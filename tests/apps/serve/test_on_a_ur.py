@@ -128,6 +128,11 @@ def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
     ), row["reason"]
 
 
+def said(words, lines):
+    """Return whether a line has these words; on a busy machine the server says in further ones that it is late."""
+    return any(words in line for line in lines)
+
+
 @pytest.mark.slow
 def test_a_client_that_is_killed_leaves_an_arm_that_stands(tmp_path):
     with served(settings={"target": {"duration": 60.0}}, lockstep=False) as (_, address, lines):
@@ -140,11 +145,11 @@ def test_a_client_that_is_killed_leaves_an_arm_that_stands(tmp_path):
             "--set",
             "target.duration=60.0",
         )
-        assert waited_for(lambda: "control program of" in lines[-1], 60.0)
+        assert waited_for(lambda: said("control program of", lines), 60.0)
         time.sleep(1.0)
         run.kill()
         run.communicate()
-        assert waited_for(lambda: "control program ended by its watchdog" in lines[-1])
+        assert waited_for(lambda: said("control program ended by its watchdog", lines)), lines
 
 
 CALLS = """
