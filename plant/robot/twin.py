@@ -85,32 +85,6 @@ def deviated(model: RobotModel, values: Mapping[str, float]) -> RobotModel:
     return model.with_arm(arm).with_camera(pose).with_lens(given(*LENS))
 
 
-def ball_rates(
-    model: RobotModel, arm: SerialArm, q: FloatArray, frames: FloatArray
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the ball of an arm that deviates from a model's, (k, 3) m in the base frame, and its derivatives by name.
-
-    Joints q (k, n) [rad], zeros and gears turn it by z_i × (p − o_i), tool and links move it along axes of frames: each
-    derivative, (k, 3) m per unit, is by the reported position of a joint or by a parameter.
-    """
-    ball = frames[:, -1, :3] @ np.append(arm.tool, 1.0)
-    turns = arm.motions(frames, ball[:, None])[:, 0]
-    # The i-th translation is along the axes of the frame before it, those of the first along the base's.
-    axes = np.insert(frames[..., :3, :3], 0, np.eye(3), axis=1)
-    rates = {}
-    for name, row, axis in links_of(arm):
-        rates[name] = model.arm.translation[row, axis] * axes[:, row, :, axis]
-    for axis, name in enumerate(TOOL):
-        rates[name] = axes[:, -1, :, axis]
-    for i, name in enumerate(arm.joint_names):
-        # `turns` is by the reported position; the true angle turns by the gear ratio as much.
-        by_angle = turns[:, i] / arm.gear_ratio[i]
-        rates[name] = turns[:, i]
-        rates[f"zero_{name}"] = by_angle
-        rates[f"gear_{name}"] = by_angle * model.arm.gear_ratio[i] * q[:, i, None]
-    return ball, rates
-
-
 @settings
 class TwinFile:
     """The keys of a file."""

@@ -33,7 +33,8 @@ from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
-from servobench.plant.robot.twin import CAMERA, LENS, ball_rates, deviated, parameter_names
+from servobench.plant.robot.parametric import ParametricModel
+from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
 
 LOG: Final = "the log"  # in error messages
 VELOCITY: Final = COMMAND.removesuffix("_command")  # as commands are misnamed
@@ -308,7 +309,8 @@ class _Evaluation(NamedTuple):
     time: FloatArray  # when the frames were exposed, (k,) [s]
     joints: FloatArray  # q, behind the gears then, (k, n) [rad]
     model: RobotModel  # the robot at θ
-    frames: FloatArray  # frames of its arm at q
+    ball: FloatArray  # in its base frame, (k, 3) m
+    image: FloatArray  # features of a camera that does not turn and a rigid tool, (k, m)
 
 
 class _Placed(NamedTuple):
@@ -399,26 +401,24 @@ class _Problem:
         geared = transmitted(self.motion(time), ripple, RIPPLE_ORDER)
         return time, geared + backlash * self.play(time)
 
-    def _seen(
-        self, model: RobotModel, values: Mapping[str, float], time: FloatArray, ball: FloatArray
-    ) -> FloatArray:
-        """Return h, (..., k, m), by the camera of a model for the ball in the base frame, (..., k, 3) m."""
-        y = _image(model, ball)
-        if "turning" in values:
-            # A soft tool lags behind by its compliance times the acceleration of the rigid one.
-            bent = y - values["compliance"] * self.pull(time)
-            y = turned(bent, values["turning"] * time)
-        return np.asarray(y)
+    def _seen(self, values: Mapping[str, float], time: FloatArray, image: FloatArray) -> FloatArray:
+        """Return h, (..., k, m), given what a camera that does not turn would see of a rigid tool."""
+        if "turning" not in values:
+            return image
+        # A soft tool lags behind by its compliance times the acceleration of the rigid one.
+        bent = image - values["compliance"] * self.pull(time)
+        return turned(bent, values["turning"] * time)
 
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
         values = self.values(z)
         time, q = self._exposed(values)
         model = deviated(self.model, values)
-        frames = model.arm.frames(q)
+        ball = model.arm.ball_position(q)
+        image = _image(model, ball)
         self._last_key = self._key(z)
-        self._last = _Evaluation(values, time, q, model, frames)
-        return np.asarray(self.y - self._seen(model, values, time, model.arm.ball(frames)))
+        self._last = _Evaluation(values, time, q, model, ball, image)
+        return np.asarray(self.y - self._seen(values, time, image))
 
     def _key(self, z: FloatArray) -> tuple[bytes, float, RobotModel]:
         return z.tobytes(), self.pace, self.model
@@ -429,49 +429,51 @@ class _Problem:
             self.errors(z)
         at: _Evaluation = self._last
         values = at.values
-        ball, motions = ball_rates(self.model, at.model.arm, at.joints, at.frames)
-        by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
-        h = self._seen(at.model, values, at.time, ball)
-        motions |= self._motions_by_camera(at.model.camera, values, ball)
+        h = self._seen(values, at.time, at.image)
+        by_joint, by_parameter = self._by_robot(at)
+        rates = {}
+        for name, rate in by_parameter.items():
+            rates[name] = prior(name) * self._turned_as_seen(at, rate)
 
-        # Chain rule: ∂h/∂z_i = s_i (∂h/∂ball) (∂ball/∂θ_i).
-        steps = STEP * np.eye(3)
-        displaced = self._seen(at.model, values, at.time, ball + steps[:, None])
-        by_ball = np.stack([*(displaced - h)], axis=-1) / STEP  # (k, m, 3)
-        rates = {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
-
-        # Parameters of the exposure change the joints that a frame shows, and with them the ball.
+        # Parameters of the exposure change the joints that a frame shows.
         sizes = STEP * np.diag([prior(name) for name in EXPOSURE])[..., None]
         later = {name: values[name] + size for name, size in zip(EXPOSURE, sizes, strict=True)}
         time, joints = self._exposed(values | later)
-        shown = ball + np.matvec(by_joint, joints - at.joints)
-        by_exposure = (self._seen(at.model, values, time, shown) - h) / STEP
+        shown = at.image + np.matvec(by_joint, joints - at.joints)
+        by_exposure = (self._seen(values, time, shown) - h) / STEP
         rates |= dict(zip(EXPOSURE, by_exposure, strict=True))
 
         # The others are those of the lens and of what the camera sees of a ball in its place.
         for name in set(self.names) - set(rates):
             changed = {**values, name: values[name] + STEP * prior(name)}
-            camera = at.model
+            image = at.image
             if name in LENS:
-                lens = np.array([changed[each] for each in LENS])
-                camera = self.model.with_camera(at.model.camera).with_lens(lens)
-            rates[name] = (self._seen(camera, changed, at.time, ball) - h) / STEP
+                camera = self.model.with_camera(at.model.camera).with_lens(_lens(changed))
+                image = _image(camera, at.ball)
+            rates[name] = (self._seen(changed, at.time, image) - h) / STEP
         return -np.stack([rates[name] for name in self.names])
 
-    def _motions_by_camera(
-        self, pose: FloatArray, values: Mapping[str, float], ball: FloatArray
-    ) -> dict[str, FloatArray]:
-        """Return the motions of the ball that look like one of the camera, by the camera's parameters.
+    def _turned_as_seen(self, at: _Evaluation, rate: FloatArray) -> FloatArray:
+        """Return the motion of h, (k, m), with one of the image."""
+        if "turning" not in at.values:
+            return rate
+        return turned(rate, at.values["turning"] * at.time)
 
-        A turned or moved camera sees what the other one would of a ball that moves the other way.
-        """
-        turn = [values[name] for name in CAMERA[:3]]
+    def _by_robot(self, at: _Evaluation) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Return the derivatives of the image by the joints, (k, m, n), and by parameters of arm and camera, (k, m)."""
+        values = at.values
+        robot = ParametricModel(self.model.with_lens(_lens(values)))
+        theta = np.array([values[name] for name in robot.names])
+        theta[robot.pose_columns] = 0.0
+        found = robot.derivatives(theta, at.model.camera[None], at.joints)
+        rates = dict(zip(robot.names, np.moveaxis(found.by_parameter, -1, 0), strict=True))
+        # Those by a turn are about the axes of the camera that has turned; here, a rotation vector grows.
+        turns = CAMERA[:3]
+        turn = np.array([values[name] for name in turns])
         turned_more = rotation_matrix(turn + STEP * np.eye(3))
-        back = pose[:3, :3] @ (self.model.camera[:3, :3] @ turned_more).mT
-        lever = ball - pose[:3, 3]
-        by_turn = (lever @ back.mT - lever) / STEP
-        by_place = -np.eye(3)
-        return dict(zip(CAMERA, (*by_turn, *by_place), strict=True))
+        further = Rotation.from_matrix(rotation_matrix(turn).T @ turned_more).as_rotvec() / STEP
+        by_turn = np.tensordot(further, np.stack([rates[name] for name in turns]), axes=1)
+        return found.by_joint, rates | dict(zip(turns, by_turn, strict=True))
 
     def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
         """Return residuals with their weights (k,) and Σ^{-1/2}, and z for its prior."""
@@ -542,6 +544,10 @@ class _Problem:
 
 def _sees_pixels(model: RobotModel) -> bool:
     return isinstance(model, SetupModel) and model.setup.name == PIXEL.name
+
+
+def _lens(values: Mapping[str, float]) -> FloatArray:
+    return np.array([values.get(name, 0.0) for name in LENS])
 
 
 def _image(model: RobotModel, ball: FloatArray) -> FloatArray:
