@@ -34,9 +34,7 @@ IntArray: TypeAlias = npt.NDArray[np.int_]
 FRAMES: Final = 96  # frames in the buffer
 RECENT: Final = 36  # the last of them, which are not thinned
 LONGEST: Final = 0.55  # [s] longest latency that is considered
-GRID: Final = (
-    0.05  # [s] between joint positions that are kept beside a frame, and a period at least
-)
+GRID: Final = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
 # Sizes of random deviations at which members begin, in four classes
 SPREADS: Final = {
     "zero": (0.05, 0.4, 1.0, 2.5),  # [rad]
@@ -57,10 +55,7 @@ STUDENT: Final = 8.0  # c [1]
 PLACE: Final = 1.0  # [m] prior deviation of the camera's place
 FLOOR: Final = 0.3e-3  # [m] least σ, in natural units
 FIRST_DAMPING: Final = 1e-2  # [1] λ
-DAMPING_FACTORS: Final = (
-    0.2,
-    8.0,
-)  # [1] changes of λ after a step that is made, and one that is not
+DAMPING_FACTORS: Final = (0.2, 8.0)  # [1] of λ after a step that is made, and one that is not
 DAMPINGS: Final = (1e-6, 1e4)  # [1] between which λ lies
 MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
 ROWS: Final = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame

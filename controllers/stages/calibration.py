@@ -68,9 +68,7 @@ class Known(NamedTuple):
     bias: FloatArray  # (..., E, m)
     feature: FloatArray  # the regression's, without its noise, (..., m)
     jacobian: FloatArray  # the regression's, (..., m, n)
-    exposed: (
-        FloatArray  # joint position at the frame's exposure, by the regression's delay, (..., n)
-    )
+    exposed: FloatArray  # joint position at the exposure, by the regression's delay, (..., n)
     fitted: BoolArray  # (...), whether the members had been fitted
 
 

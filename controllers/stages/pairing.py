@@ -60,9 +60,7 @@ MIN_CHANGE_RATIO: Final = 0.8  # [1]
 # A model error below this share of the noise cannot favour a wrong delay, so that a steady motion counts as well.
 MAX_BIAS_RATIO: Final = 0.25  # [1]
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
-MAX_LATENESS: Final = (
-    1.0  # [s] a change of the age of frames beyond it is one of the camera's clock
-)
+MAX_LATENESS: Final = 1.0  # [s] a larger change of the age of frames is one of the camera's clock
 # [s] by which the age that counts as not late follows that of a frame: 200 ppm of the least duration of a motion
 DRIFT_STEP: Final = 1e-5
 DOUBT_GATE: Final = 100.0  # [1] g

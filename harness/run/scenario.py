@@ -51,9 +51,8 @@ class Scenario:
     kind: TaskKind = "curve"  # whether the reference is a fixed target, moves, or jumps
     lap_time: float = math.nan  # time of a lap of a curve that is repeated [s]; NaN of any other
     moves: tuple[Span, ...] = ()  # parts of a sequence in which a target is held
-    jumps: tuple[
-        float, ...
-    ] = ()  # instants at which the reference jumps, which no preview shows [s]
+    # instants at which the reference jumps, which no preview shows [s]
+    jumps: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the evaluated part is one of the run, and the kind."""
