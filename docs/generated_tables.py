@@ -222,8 +222,9 @@ def aids_in_words(aids: AidsConfig) -> str:
     """Return `none`, `all`, or all with what differs from all."""
     if not differences(aids):
         return "none"
-    other = [key for key, value in EQUIPPED.items() if getattr(aids, key) != value]
-    words = (f"`{key}` {getattr(aids, key)}".replace("False", "off") for key in other)
+    usual = flatten(AidsConfig(**EQUIPPED))
+    other = {key: value for key, value in flatten(aids).items() if value != usual[key]}
+    words = (f"`{key}` {value}".replace("False", "off") for key, value in other.items())
     return "all" + (f", but {', '.join(words)}" if other else "")
 
 

@@ -42,7 +42,8 @@ def config_classes():
     """Every class of settings that a user can reach; settings of nested sections are in the table of the outer one."""
     parts = [entry.config for entry in (*ESTIMATORS.values(), *LAWS.values())]
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
-    whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
+    bounds = [registry.find_controller(name).config for name in ("nmpc_calibrated", "revealed")]
+    whole = [*plants, FmuConfig, *bounds]
     tasks = [type(entry.default) for entry in TASKS.values()]
     common = [
         AidsConfig,
@@ -105,8 +106,10 @@ def told_aids(cell):
     if cell == "none":
         return {}
     assert cell.startswith("all")
-    other = dict(re.findall(r"`(\w+)` (\w+)", cell))
-    return {**EQUIPPED, **{key: False if value == "off" else value for key, value in other.items()}}
+    other = dict(re.findall(r"`(\w+)` ([\w.]+)", cell))
+    switched = {key: False if value == "off" else value for key, value in other.items()}
+    numbers = {key: float(value) for key, value in other.items() if "." in value}
+    return {**EQUIPPED, **switched, **numbers}
 
 
 def test_the_table_of_controllers_has_their_parts_and_aids():
@@ -136,7 +139,8 @@ def short_runs():
     """A short run of each estimator, each law, the aids, and what is no pair."""
     pairs = [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS]
     controllers = [*pairs, "regression_mfac", "nmpc_calibrated"]
-    settings = read_settings(None, ["exp2.duration=0.2", "run.full_jacobian=true"])
+    chosen = ["exp2.duration=0.2", "run.full_jacobian=true", "kinematic.sensing.stamps=true"]
+    settings = read_settings(None, chosen)
     return [
         run_experiment(RunRequest("kinematic", controller, "exp2", "moderate", 0), settings)
         for controller in controllers
