@@ -179,6 +179,7 @@ _STYLES = {
     "rbf_pid": MethodStyle(ORANGE, "-", "D"),
     "calibrated": MethodStyle(BLACK, "-.", ""),
     "nmpc_calibrated": MethodStyle(BLACK, ":", "x"),
+    "revealed": MethodStyle(GREY, "-.", "+"),
     "constant": MethodStyle(GREY, ":", "v"),
     "broyden": MethodStyle(PURPLE, "-", "P"),
     "rls": MethodStyle(SKY, "-", "X"),
