@@ -217,9 +217,9 @@ def test_each_metric_is_shown_in_its_unit_with_its_digits():
         for name in ("controller", "number", "settled [%]", "followed [%]", "lost [%]"):
             table.pop(name, None)
     assert shown["moves"] == {
-        "settling time [s]": "1.23", "overshoot [%]": "123.5", "error of the last second [mm]": "1234.57",
-        "pose error of the last second [mm]": "1.2", "angle error of the last second [deg]": "1.23",
-        "path ratio": "1.235", "sign switches": "1",
+        "settling time [s]": "1.23", "later moves [s]": "1.23", "overshoot [%]": "123.5",
+        "error of the last second [mm]": "1234.57", "pose error of the last second [mm]": "1.2",
+        "angle error of the last second [deg]": "1.23", "path ratio": "1.235", "sign switches": "1",
     }  # fmt: skip
     assert shown["curves"] == {
         "RMS error of the second lap [mm]": "2345.68", "RMS error of the judged part [mm]": "1234.57",
