@@ -34,7 +34,8 @@ class RevealedConfig:
 class Revealed(Controller):
     """The method `regression_mfac` until the reveal time, and `calibrated` from then on.
 
-    No method that has to learn in the same time can be better by the same law: it is the score of a perfect learner.
+    It does as well as a learner that knows nothing until then and everything afterwards, with the law of `calibrated`.
+    A method that learns earlier, moves better meanwhile, or has another law may be better.
     `calibrated` follows the run from its start, so that it knows which commands are still under way.
     """
 

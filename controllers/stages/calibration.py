@@ -33,9 +33,9 @@ from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
-MANY: Final = 24  # members at first
-FEWER: Final = ((0.6, 8), (2.0, 3))  # [s] and members from then on
-INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
+MEMBERS: Final = 24  # members at first
+MEMBERS_LATER: Final = ((0.6, 8), (2.0, 3))  # [s] and members from then on
+ITERATION_INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
 FIRST_ITERATIONS: Final = 6
 MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
 NOISE: Final = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
@@ -129,8 +129,8 @@ class Calibration:
         features = np.zeros((*rows, m))
         paths = np.zeros((*rows, fit.rows, n))
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
-        members = fit.spawned(lead, zero, MANY, none)
-        size = (*lead, MANY)
+        members = fit.spawned(lead, zero, MEMBERS, none)
+        size = (*lead, MEMBERS)
         periods = self._periods
         if np.isfinite(observation.capture_time).any():
             periods += whole_periods(MAX_LATENESS, self._period)
@@ -141,7 +141,7 @@ class Calibration:
             history=history.copy(),
             frames=frames,
             members=members,
-            share=np.full(size, 1.0 / MANY),
+            share=np.full(size, 1.0 / MEMBERS),
             bias=np.zeros((*size, m)),
             fitted=no,
             lateness=none,
@@ -152,7 +152,7 @@ class Calibration:
             errors=np.full((*lead, 2), np.nan),
             used=no,
             passed=zero,
-            spawned=zero + MANY,
+            spawned=zero + MEMBERS,
             tried=none,
             past=(),
         )
@@ -181,7 +181,7 @@ class Calibration:
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
         state = state._replace(history=history, travel=travel, elapsed=elapsed)
-        for begin, size in FEWER:
+        for begin, size in MEMBERS_LATER:
             if elapsed > begin and state.share.shape[-1] > size:
                 state = self._reduced(state, size)
         past = state.past
@@ -227,7 +227,7 @@ class Calibration:
         state = branch(begins, self._begun, state, elapsed, delay, level)
         state = state._replace(passed=state.passed + 1)
         explained = many & (state.rms < EXPLAINED * noise)
-        iterates = state.fitted & (~explained | (state.passed >= INTERVAL))
+        iterates = state.fitted & (~explained | (state.passed >= ITERATION_INTERVAL))
         state = branch(iterates, self._continued, state, elapsed, level)
         used = self._trusted(state)
         lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
@@ -442,6 +442,10 @@ class Calibration:
         regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     ) -> tuple[Known, ...]:
         """Return what is known at the last frames, with this one where it is due."""
+        # Members become fewer at the same time in all lanes, whether a frame is due or not.
+        same_size = bool(past) and past[-1].share.shape == state.share.shape
+        if same_size and not np.any(due):
+            return past
         feature, jacobian, delay, _ = regression
         path = self._path(state.history, None)
         exposed, _ = at_latency(path[..., None, :, :], delay[..., None], self.fit.grid)

@@ -289,7 +289,7 @@ class Past(NamedTuple):
     # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
     window: FloatArray
     noise: FloatArray  # e, (..., m), of the last frame from which was learned.
-    late: LateFrame | None  # of the present frame; None without stamps
+    late: LateFrame | None  # the present frame; None without stamps
 
 
 @final

@@ -32,7 +32,7 @@ from servobench.plant.contract.units import split_quantity
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
 BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
-WINE, INDIGO = "#882255", "#332288"  # of Tol's palette, which goes with it
+WINE, INDIGO = "#882255", "#332288"  # from Tol's palette, which goes with it
 MARKS = 8  # markers on each line
 WIDTH = 7.2  # [in] width of a figure: both columns of a paper
 MAX_LINES = 7  # methods in a panel, not counting those that know the true robot

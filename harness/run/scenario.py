@@ -150,7 +150,7 @@ class Task(ABC):
     """Whether it also runs on a plant with a robot of its own: no target is given as joint positions."""
     places: ClassVar[tuple[str, ...]] = ()
     """Settings that are moved for another arm: points of the camera frame, and `start`, which is its home."""
-    judged_part: ClassVar[str] = "from the time on that its code gives as evaluate_from"
+    judged_part: ClassVar[str] = "from the time that its code sets as evaluate_from"
     """Words for the judged part of a curve."""
 
     @property

@@ -27,7 +27,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import Count, Duration, settings
 
-EVERY: Final = 3  # targets, the last of which is a corner of the box
+CORNER_INTERVAL: Final = 3  # targets, the last of which is a corner of the box
 CORNERS_AT_ONCE: Final = 64
 MAX_DRAWS: Final = 100  # draws of the next target, or of a curve
 LAP_POINTS: Final = 16  # points of a curve that must be fit
@@ -54,7 +54,7 @@ class TourTask(BoxTask):
         start, target = next(moves)
         places = [target]
         while len(places) < self.targets:
-            if len(places) % EVERY == EVERY - 1:
+            if len(places) % CORNER_INTERVAL == CORNER_INTERVAL - 1:
                 candidates = _corners(box, setting, generator)
             else:
                 candidates = (posture[None] for _, posture in moves)

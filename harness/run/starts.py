@@ -120,14 +120,11 @@ def drawn_moves(
         while True:
             yield draw_in_view(box, robot, setting.nominal, true, generator)
     n = robot.n
-    clear = robot.workspace.clear
     for _ in range(MAX_PAIRS // PAIRS_AT_ONCE):
         pairs = generator.uniform(box.lower, box.upper, (PAIRS_AT_ONCE, 2, n))
         balls = robot.arm.ball_position(pairs)
         apart = norm(balls[:, 1] - balls[:, 0]) >= box.shortest
-        fit = apart & (balls[:, :, 2] >= box.lowest).all(axis=-1)
-        if clear is not None:
-            fit &= clear(pairs).all(axis=-1)
+        fit = apart & _is_free(pairs, box, robot).all(axis=-1)
         for start, target in pairs[fit]:
             if stays_in_reach(target, box, setting):
                 yield start, target
@@ -239,8 +236,8 @@ def _fit(
 
 
 def _is_free(postures: FloatArray, box: Box, robot: Robot) -> npt.NDArray[np.bool_]:
-    """Return in which postures (k, n) rad nothing touches the table or the arm, (k,)."""
-    free = robot.arm.ball_position(postures)[:, 2] >= box.lowest
+    """Return in which postures (..., n) rad nothing touches the table or the arm, (...)."""
+    free = robot.arm.ball_position(postures)[..., 2] >= box.lowest
     if robot.workspace.clear is not None:
         free &= robot.workspace.clear(postures)
     return np.asarray(free)

@@ -250,7 +250,7 @@ def test_the_judged_part_is_named_for_each_curve_and_that_of_a_user_s_task_is_it
     )
     assert summary_legend(curves).splitlines()[1] == (
         "judged part of circle: the last lap; judged part of line, waypoints: the second half; "
-        "judged part of Spiral: from the time on that its code gives as evaluate_from"
+        "judged part of Spiral: from the time that its code sets as evaluate_from"
     )
 
 
