@@ -58,6 +58,9 @@ FIRST_DAMPING: Final = 1e-2  # [1] λ
 DAMPING_FACTORS: Final = (0.2, 8.0)  # [1] of λ after a step that is made, and one that is not
 DAMPINGS: Final = (1e-6, 1e4)  # [1] between which λ lies
 MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
+SUPPORT: Final = np.array(
+    [-1, 0, 1, 2]
+)  # rows on which a spline stands, from the one before an instant
 ROWS: Final = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
 
 
@@ -83,11 +86,11 @@ class Members(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Residuals of members with their derivatives."""
+    """Residuals of members with their derivatives; frames are the last axis, along which most work is done."""
 
-    residual: FloatArray  # y − h, (..., E, F, m)
-    rates: FloatArray  # ∂h by θ, L and ω, (..., E, F, m, P + 2)
-    motion: FloatArray  # ẏ, (..., E, F, m), 1/s
+    residual: FloatArray  # y − h, (..., E, m, F)
+    rates: FloatArray  # ∂h by θ, L and ω, (..., E, P + 2, m, F)
+    motion: FloatArray  # ẏ, (..., E, m, F), 1/s
 
 
 def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatArray, FloatArray]:
@@ -105,12 +108,11 @@ def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatA
     x = np.clip(last - delay / grid, 0.0, last)
     first = np.minimum(x.astype(np.int_), last - 1)
     u = (x - first)[..., None, None]
-    rows = []
-    for shift in (-1, 0, 1, 2):
-        index = np.clip(first + shift, 0, last)
-        row = np.take_along_axis(path[..., None, :, :, :], index[..., None, None, None], axis=-2)
-        rows.append(row[..., 0, :])
-    before, begin, end, after = rows
+    # A delay is the same for all frames: whole rows of them are taken.
+    rows = np.moveaxis(path, -2, delay.ndim - 1)
+    index = np.clip(first[..., None] + SUPPORT, 0, last)
+    support = pick(rows, index, axes=2)
+    before, begin, end, after = np.moveaxis(support, delay.ndim, 0)
     slope_begin = 0.5 * (end - before)
     slope_end = 0.5 * (after - begin)
     # At the ends of the path the slope is that of the last interval.
@@ -161,8 +163,10 @@ def added(
 
 def first(frames: Frames, most: int) -> Frames:
     """Return the buffer with `most` rows at most, a number that does not depend on other lanes."""
+    if most >= FRAMES:
+        return frames
     axis = frames.time.ndim - 1
-    kept = range(min(most, FRAMES))
+    kept = range(most)
     return each_row(frames, lambda array: array.take(kept, axis=axis))
 
 
@@ -176,17 +180,38 @@ def whitened(
         lateness: s, (...) [s].
         variance: σ², (..., E).
     """
-    motion = fitted.motion
-    square = np.vecdot(motion, motion)
-    unit = motion / np.sqrt(np.maximum(square, 1e-12))[..., None]
+    bare = (fitted.residual, fitted.rates)
+    return branch(lateness > 0.0, _whitened, bare, fitted.motion, lateness, variance)
+
+
+def _whitened(
+    bare: tuple[FloatArray, FloatArray],
+    motion: FloatArray,
+    lateness: FloatArray,
+    variance: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return both of frames that are late."""
+    residual, rates = bare
+    square = squared(motion)
+    unit = motion / np.sqrt(np.maximum(square, 1e-12))[..., None, :]
     late = np.square(lateness)[..., None, None]
     excess = late * square / variance[..., None]
     share = 1.0 - 1.0 / np.sqrt(1.0 + excess)
-    along = share * np.vecdot(unit, fitted.residual)
-    residual = fitted.residual - along[..., None] * unit
-    slopes = share[..., None] * np.vecmat(unit, fitted.rates)
-    rates = fitted.rates - unit[..., None] * slopes[..., None, :]
-    return residual, rates
+    along = share * np.add.reduce(unit * residual, axis=-2)
+    directions = unit[..., None, :, :]
+    slopes = share[..., None, :] * np.add.reduce(directions * rates, axis=-2)
+    new = residual - along[..., None, :] * unit
+    return new, rates - slopes[..., None, :] * directions
+
+
+def without_rates(fitted: Fitted) -> Fitted:
+    """Return residuals alone."""
+    return fitted._replace(rates=fitted.rates[..., :0, :, :])
+
+
+def squared(vectors: FloatArray) -> FloatArray:
+    """Return ‖v‖², (..., F), of vectors (..., m, F)."""
+    return np.asarray(np.add.reduce(vectors * vectors, axis=-2))
 
 
 @final
@@ -259,34 +284,39 @@ class Fit:
         since = frames.time[..., None, :]
         turn = members.turning[..., None] * since
         found = self.model.derivatives(members.theta, members.cameras, q, turn)
-        weight = frames.weight[..., None, :, :]
-        motion = np.matvec(found.by_joint, v)
-        by_turning = found.by_parameter[..., self.first_turn] * since[..., None]
-        rates = np.concatenate(
-            [found.by_parameter, -motion[..., None], by_turning[..., None]], axis=-1
-        )
-        residual = frames.feature[..., None, :, :] - found.feature / self.scale
-        return Fitted(
-            residual=weight * residual,
-            rates=weight[..., None] * rates / self.scale,
-            motion=weight * motion / self.scale,
-        )
+        weight = np.swapaxes(frames.weight, -1, -2)[..., None, :, :]
+        # In the unit of the frames' features; 0 for those that are not valid.
+        size = weight / self.scale
+        by_joint = np.swapaxes(found.by_joint, -1, -3)
+        velocity = np.swapaxes(v, -1, -2)[..., None, :]
+        motion = size * np.add.reduce(by_joint * velocity, axis=-3)
+        by_parameter = np.swapaxes(found.by_parameter, -1, -3)
+        shape = by_parameter.shape
+        rates = np.empty((*shape[:-3], self.count + 2, *shape[-2:]))
+        np.multiply(by_parameter, size[..., None, :, :], out=rates[..., :-2, :, :])
+        rates[..., -2, :, :] = -motion
+        rates[..., -1, :, :] = rates[..., self.first_turn, :, :] * since[..., None, :]
+        return Fitted(self._missed(frames, found.feature), rates, motion)
 
     def residual(self, members: Members, frames: Frames) -> FloatArray:
-        """Return y − h of members at the frames, (..., E, F, m)."""
+        """Return y − h of members at the frames, (..., E, m, F)."""
         q, _ = at_latency(frames.path, members.latency, self.grid)
         turn = members.turning[..., None] * frames.time[..., None, :]
-        seen = self.model.feature(members.theta, members.cameras, q, turn)
-        residual = frames.feature[..., None, :, :] - seen / self.scale
-        return frames.weight[..., None, :, :] * residual
+        return self._missed(frames, self.model.feature(members.theta, members.cameras, q, turn))
+
+    def _missed(self, frames: Frames, seen: FloatArray) -> FloatArray:
+        """Return residuals, (..., E, m, F), where features (..., E, F, m) of the model are seen."""
+        feature = frames.feature[..., None, :, :]
+        weight = frames.weight[..., None, :, :]
+        residual = weight * (feature - seen / self.scale)
+        return np.swapaxes(residual, -1, -2)
 
     def costs(
         self, members: Members, fitted: Fitted, lateness: FloatArray, variance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the cost of members, (..., E), and ‖r_k‖²/σ² of their frames, (..., E, F)."""
-        bare = fitted._replace(rates=np.zeros((*fitted.rates.shape[:-1], 0)))
-        residual, _ = whitened(bare, lateness, variance)
-        square = np.vecdot(residual, residual) / variance[..., None]
+        residual, _ = whitened(without_rates(fitted), lateness, variance)
+        square = squared(residual) / variance[..., None]
         data = STUDENT * np.log1p(square / STUDENT)
         cost = np.add.reduce(data, axis=-1) + self._prior_cost(members)
         return cost, square
@@ -351,14 +381,15 @@ class Fit:
         residual, rates = whitened(fitted, lateness, variance)
         cost, square = self.costs(members, fitted, lateness, variance)
         weight = 1.0 / (1.0 + square / STUDENT) / variance[..., None]
-        # Frames and features are one axis of the products.
-        tall = (*rates.shape[:-3], -1)
-        D = rates.reshape(*tall, rates.shape[-1])
-        w = np.repeat(weight, rates.shape[-2], axis=-1)
-        weighted = D * w[..., None]
+        weighted = rates * weight[..., None, None, :]
         information, pull = self._prior_slope(members)
-        H = np.swapaxes(weighted, -1, -2) @ D
-        g = np.vecmat(residual.reshape(tall), weighted) + pull
+        # Features and frames are one axis of the products.
+        wide = (*rates.shape[:-2], -1)
+        D = rates.reshape(wide)
+        Dw = weighted.reshape(wide)
+        r = residual.reshape(*wide[:-2], -1)
+        H = Dw @ np.swapaxes(D, -1, -2)
+        g = np.matvec(Dw, r) + pull
         diagonal = np.diagonal(H, axis1=-2, axis2=-1) + information
         damped = information + members.damping[..., None] * diagonal
         A = plus_diagonal(H, damped)

@@ -25,7 +25,9 @@ from servobench.controllers.stages.arm_fit import (
     added,
     at_latency,
     first,
+    squared,
     whitened,
+    without_rates,
 )
 from servobench.controllers.stages.pairing import MAX_LATENESS, rows_ago
 from servobench.plant.contract.checks import FloatArray
@@ -265,7 +267,7 @@ class Calibration:
         members = fit.aligned(members, frames)
         floor = np.square(FLOOR) + np.square(noise)[..., None]
         residual = fit.residual(members, frames)
-        square = np.vecdot(residual, residual)
+        square = squared(residual)
         wide = np.maximum(floor, np.median(square, axis=-1) / 3.0)
         for left in range(FIRST_ITERATIONS):
             variance = np.maximum(floor, wide * 0.25**left)
@@ -293,11 +295,9 @@ class Calibration:
         likelihood = np.exp(np.maximum(-0.5 * excess, MIN_EXPONENT))
         share = likelihood / np.add.reduce(likelihood, axis=-1)[..., None]
         state = state._replace(members=state.members._replace(cost=cost), share=share)
-        residual, _ = whitened(
-            fitted._replace(rates=fitted.rates[..., :0]), state.lateness, variance
-        )
+        residual, _ = whitened(without_rates(fitted), state.lateness, variance)
         there = np.maximum.reduce(frames.weight, axis=-1) > 0.0
-        square = np.vecdot(residual, residual)
+        square = squared(residual)
         own = pick(square, best)
         rms = np.sqrt(_median_of(own, there) / 2.366)
         bias = self._bias(
@@ -323,7 +323,8 @@ class Calibration:
         weight = age[..., None, :] * inlier + 1e-9
         total = np.add.reduce(weight, axis=-1)
         count = total * total / np.add.reduce(weight * weight, axis=-1)
-        mean = np.vecmat(weight, residual) / total[..., None]
+        sums = np.add.reduce(weight[..., None, :] * residual, axis=-1)
+        mean = sums / total[..., None]
         expected = 3.0 * np.square(np.maximum(noise, 1e-4))[..., None] / count
         significance = np.vecdot(mean, mean) / expected
         kept = np.clip(1.0 - 2.0 / np.maximum(significance, 1e-9), 0.0, 1.0)
@@ -335,17 +336,16 @@ class Calibration:
         """Return the state with the lateness of frames by the spread of residuals along their motion."""
         residual = pick(fitted.residual, best)
         motion = pick(fitted.motion, best)
-        speed = norm(motion)
+        square = squared(motion)
+        speed = np.sqrt(square)
         fast = (speed > FAST) & there
-        unit = motion / np.maximum(speed, 1e-9)[..., None]
-        along = np.vecdot(unit, residual)
-        aside = residual - along[..., None] * unit
-        side = np.vecdot(aside, aside)
+        unit = motion / np.maximum(speed, 1e-9)[..., None, :]
+        along = np.add.reduce(unit * residual, axis=-2)
+        side = squared(residual - along[..., None, :] * unit)
         enough = np.add.reduce(fast, axis=-1) > 12
         across = _median_of(side, fast) / 1.386
         fine = fast & (side < 12.0 * across[..., None])
-        square = np.maximum(speed * speed, FAST**2)
-        ratio = (along * along - across[..., None]) / square
+        ratio = (along * along - across[..., None]) / np.maximum(square, FAST**2)
         middle = np.maximum(_median_of(ratio, fine), 0.0)
         capped = np.minimum(ratio, 8.0 * middle[..., None]) * fine
         number = np.maximum(np.add.reduce(fine, axis=-1), 1)

@@ -14,12 +14,18 @@ rotation vector δ in its own frame or moved by d in that of its mount, by
 
     ∂x/∂δ = [x]×                         ∂x/∂d = −R_cᵀ
 
-All arrays have leading axes: an ensemble of robots, or runs side by side, is one model.
+All of them are computed in the frames of the cameras: the chain begins at the base as a camera sees it. Cameras on the
+hand see it by way of the flange.
+
+Arrays have leading axes: an ensemble of robots, or runs side by side, is one model. In here the coordinates x, y and z
+are the first axis of each array and the k joint positions the last one, so that every operation runs along many
+contiguous numbers; matrices of 3 × 3 would cost ten times as much.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, TypeAlias, final
+from typing import Final, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +33,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import Derivatives
 from servobench.plant.contract.lanes import nearest_rotation
-from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.twin import TOOL, links_of
 
@@ -36,6 +42,37 @@ TARGET: Final = ("target_x", "target_y", "target_z")
 ALIGNMENT: Final = 0.002  # [m²] weight of the planned rotation in `placed`
 Indices: TypeAlias = npt.NDArray[np.int_]
 POSE: Final = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+
+
+class Frame(NamedTuple):
+    """The axes and the origin of a frame, with their coordinates as the first axis, (3, *)."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    origin: FloatArray  # [m]
+
+    def moved(self, translation: Iterable[FloatArray | float]) -> "Frame":
+        """Return the frame moved along its own axes [m]."""
+        return self._replace(origin=self.origin + _sum_of(self[:3], translation))
+
+    def rotated(self, rotation: FloatArray) -> "Frame":
+        """Return the frame rotated by a matrix, (3, 3), of its own axes."""
+        x, y, z = (_sum_of(self[:3], column) for column in rotation.T)
+        return Frame(x, y, z, self.origin)
+
+    def about_z(self, cosine: FloatArray, sine: FloatArray) -> "Frame":
+        """Return the frame rotated about its z axis."""
+        x, y = _turned(self.x, self.y, cosine, sine)
+        return Frame(x, y, self.z, self.origin)
+
+
+class Seen(NamedTuple):
+    """A robot as its cameras see it."""
+
+    mount: Frame  # the frame that they are mounted on
+    frames: list[Frame]  # the base, the frames after each joint, and the flange
+    points: FloatArray  # of the target, (3, p, c, ..., k)
 
 
 @final
@@ -96,34 +133,6 @@ class ParametricModel:
         theta[..., self.pose_columns] = 0.0
         return theta, new
 
-    def robot(self, theta: FloatArray, cameras: FloatArray) -> RobotModel:
-        """Return the robot of a state for joint positions side by side: its leading axes end in one of length 1 or k.
-
-        Args:
-            theta: (..., P).
-            cameras: (..., 1 or k, c, 4, 4).
-        """
-        planned = self.planned.arm
-        n = planned.n
-        lead = theta.shape[:-1]
-        translation = np.broadcast_to(planned.translation, (*lead, n + 1, 3)).copy()
-        row, axis = self._lengths
-        translation[..., row, axis] *= 1.0 + theta[..., self._links]
-        place = theta[..., :3]
-        on_flange = self.planned.mount == "fixed"
-        arm = SerialArm(
-            joint_names=planned.joint_names,
-            translation=translation[..., None, :, :],
-            rpy=np.broadcast_to(planned.rpy, (*lead, 1, n + 1, 3)),
-            joint_offset=(planned.joint_offset + theta[..., self._zeros])[..., None, :],
-            gear_ratio=(planned.gear_ratio * (1.0 + theta[..., self._gears]))[..., None, :],
-            tool=(planned.tool + place * on_flange)[..., None, :],
-        )
-        model = self.planned.rebuilt(arm, cameras)
-        if on_flange:
-            return model
-        return model.with_target(self.planned.marks + place[..., None, None, :])
-
     def feature(
         self,
         theta: FloatArray,
@@ -132,8 +141,8 @@ class ParametricModel:
         turn: FloatArray | None = None,
     ) -> FloatArray:
         """Return y, (..., k, m), for joint positions (..., k, n) [rad]; `turn` as in `derivatives`."""
-        model = self.robot(theta, turned(cameras, turn))
-        return model.measure(model.in_cameras(model.points(joints)))
+        seen = self._seen(theta, cameras, joints, turn)
+        return self.planned.measure(_reversed_last(seen.points, 3))
 
     def derivatives(
         self,
@@ -150,34 +159,13 @@ class ParametricModel:
             joints: (..., k, n) [rad].
             turn: by which the first camera is turned about its optical axis, (..., k) [rad]; None for 0.
         """
-        model = self.robot(theta, turned(cameras, turn))
-        frames = model.arm.frames(joints)
-        flange = frames[..., -1, :, :]
-        target = model.in_base(flange)
-        motions = self._motions(model.arm, frames, target, joints)
-        if model.mount == "hand":
-            # Seen from the hand, the target moves the opposite way, but with its own place.
-            motions = -np.vecmat(motions, flange[..., None, None, :3, :3])
-        count = motions.shape[-2]
-        by_place = np.swapaxes(flange[..., :3, :3], -1, -2)
-        if model.mount == "hand":
-            by_place = flange[..., :3, :3]
-        by_place = np.broadcast_to(by_place[..., None, :, :], (*motions.shape[:-2], 3, 3))
-        motions = np.concatenate([motions, by_place], axis=-2)
-
-        points = model.in_cameras(model.mounted(flange, target))
-        rotations = model.poses[..., None, None, :3, :3]
-        in_camera = np.vecmat(motions[..., None, :, :, :], rotations)
-        seen = np.swapaxes(in_camera, -1, -2)
-        every = np.concatenate([seen, self._by_pose(model, points, turn)], axis=-1)
-        y = model.measure(points)
-        rates = model.change(points, every)
-        n = model.arm.n
-        by_joint = rates[..., :n]
-        by_parameter = np.concatenate(
-            [rates[..., count : count + 3], rates[..., n:count], rates[..., count + 3 :]], axis=-1
-        )
-        return Derivatives(y, by_joint, by_parameter)
+        seen = self._seen(theta, cameras, joints, turn)
+        motions = self._motions(theta, joints, turn, seen)
+        places = _reversed_last(seen.points, 3)
+        y = self.planned.measure(places)
+        rates = self.planned.change(places, _reversed_last(motions, 4))
+        n = self.planned.arm.n
+        return Derivatives(y, by_joint=rates[..., :n], by_parameter=rates[..., n:])
 
     def placed(
         self,
@@ -198,8 +186,8 @@ class ParametricModel:
         """
         if self.planned.channel.unit != "m" or self.planned.mount != "fixed":
             return cameras
-        model = self.robot(theta, turned(cameras, None))
-        ball = model.points(joints)[..., 0, :]
+        frames = self._frames(theta, joints, _identity(joints.ndim))
+        ball = _reversed_last(self._points(theta, frames), 3)[..., 0, 0, :]
         total = np.add.reduce(weight, axis=-1)
         share = (weight / total[..., None])[..., None, :]
         middle = share @ ball
@@ -233,66 +221,177 @@ class ParametricModel:
         table: Indices = np.array(places, dtype=np.int_).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
+    @cached_property
+    def _rotations(self) -> FloatArray:
+        """The fixed rotations before each joint and the flange, (n+1, 3, 3)."""
+        return rotation_from_rpy(self.planned.arm.rpy)
+
+    def _seen(
+        self,
+        theta: FloatArray,
+        cameras: FloatArray,
+        joints: FloatArray,
+        turn: FloatArray | None,
+    ) -> Seen:
+        """Return the robot as each camera sees it."""
+        mount = _mount_in(cameras, turn)
+        base = mount
+        if self.planned.mount == "hand":
+            flange = self._frames(theta, joints, _identity(joints.ndim))[-1]
+            # The camera sees the axes of the flange, in which those of the base are known.
+            coordinates = zip(flange.x, flange.y, flange.z, strict=True)
+            x, y, z = (_sum_of(mount[:3], each) for each in coordinates)
+            base = Frame(x, y, z, mount.origin - _sum_of((x, y, z), flange.origin))
+        frames = self._frames(theta, joints, base)
+        return Seen(mount, frames, self._points(theta, frames))
+
+    def _frames(self, theta: FloatArray, joints: FloatArray, base: Frame) -> list[Frame]:
+        """Return the base, the frames after each joint and the flange."""
+        arm = self.planned.arm
+        gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
+        offset = arm.joint_offset + theta[..., self._zeros]
+        angles = gear[..., None, :] * joints + offset[..., None, :]
+        angles = np.ascontiguousarray(np.moveaxis(angles, -1, 0))
+        cosines = np.cos(angles)
+        sines = np.sin(angles)
+        frames = [base]
+        for row in range(arm.n + 1):
+            frame = frames[-1].moved(self._translation(theta, row)).rotated(self._rotations[row])
+            if row < arm.n:
+                frame = frame.about_z(cosines[row], sines[row])
+            frames.append(frame)
+        return frames
+
+    def _translation(self, theta: FloatArray, row: int) -> list[FloatArray | float]:
+        """Return the translation before a joint, in which lengths deviate."""
+        translation: list[FloatArray | float] = list(self.planned.arm.translation[row])
+        rows, axes = self._lengths
+        for index in np.flatnonzero(rows == row):
+            stretch = 1.0 + theta[..., self._links][..., index, None]
+            translation[axes[index]] = translation[axes[index]] * stretch
+        return translation
+
+    def _target(self, frames: list[Frame]) -> Frame:
+        """Return the frame that the target is fixed to."""
+        return frames[-1] if self.planned.mount == "fixed" else frames[0]
+
+    def _points(self, theta: FloatArray, frames: list[Frame]) -> FloatArray:
+        """Return the points of the target, (3, p, c, ..., k)."""
+        frame = self._target(frames)
+        shift = np.moveaxis(theta[..., :3], -1, 0)[..., None]
+        points = []
+        for mark in self.planned.marks:
+            place = [own + more for own, more in zip(mark, shift, strict=True)]
+            points.append(frame.moved(place).origin)
+        return np.stack(points, axis=1)
+
     def _motions(
-        self, arm: SerialArm, frames: FloatArray, target: FloatArray, joints: FloatArray
+        self, theta: FloatArray, joints: FloatArray, turn: FloatArray | None, seen: Seen
     ) -> FloatArray:
-        """Return the motions of the target, (..., k, p, ·, 3), by joints, gears, zeros and links, in this order."""
-        by_joint = arm.motions(frames, target)
-        by_zero = by_joint / arm.gear_ratio[..., None, :, None]
-        planned = self.planned.arm
-        by_gear = by_zero * (planned.gear_ratio * joints)[..., None, :, None]
-        row, axis = self._lengths
-        # The i-th translation is along the axes of the frame before it, those of the first along the base's.
-        before = np.broadcast_to(np.eye(3), (*frames.shape[:-3], 1, 3, 3))
-        axes = np.concatenate([before, frames[..., :3, :3]], axis=-3)
-        along = np.swapaxes(axes, -1, -2)[..., row, axis, :]
-        by_link = planned.translation[row, axis][:, None] * along
-        by_link = np.broadcast_to(
-            by_link[..., None, :, :], (*by_joint.shape[:-2], *by_link.shape[-2:])
-        )
-        return np.concatenate([by_joint, by_gear, by_zero, by_link], axis=-2)
+        """Return the motions of points by joints and parameters, (n + P, 3, p, c, ..., k)."""
+        arm = self.planned.arm
+        n = arm.n
+        points = seen.points
+        frames = seen.frames
+        motions = np.zeros((n + len(self.names), *points.shape))
+        by_joint = motions[:n]
+        by_parameter = motions[n:]
+        # Seen from the hand, the target moves the opposite way.
+        sign = 1.0 if self.planned.mount == "fixed" else -1.0
+        gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
+        by_gear = by_parameter[self._gears]
+        by_zero = by_parameter[self._zeros]
+        for joint, frame in enumerate(frames[1:-1]):
+            lever = points - frame.origin[:, None]
+            motion = _cross(sign * frame.z[:, None], lever)
+            by_zero[joint] = motion
+            by_joint[joint] = gear[..., joint, None] * motion
+            by_gear[joint] = arm.gear_ratio[joint] * joints[..., joint] * motion
+        for motion, row, axis in zip(by_parameter[self._links], *self._lengths, strict=True):
+            # The i-th translation is along the axes of the frame before it.
+            motion[...] = sign * arm.translation[row, axis] * frames[row][axis][:, None]
+        target = self._target(frames)
+        for motion, direction in zip(by_parameter[:3], target[:3], strict=True):
+            motion[...] = direction[:, None]
+        self._write_poses(by_parameter[self.pose_columns], turn, seen)
+        return motions
 
-    def _by_pose(
-        self, model: RobotModel, points: FloatArray, turn: FloatArray | None
-    ) -> FloatArray:
-        """Return the motions of points (..., k, c, p, 3) in each camera with the poses of all, (..., c, p, 3, 6 c)."""
-        count = points.shape[-3]
-        turns = skew(points)
-        if turn is not None:
-            # δ turns the camera before its own turn: R exp([δ]×) R_z = R R_z exp([R_zᵀ δ]×).
-            turns[..., 0, :, :, :] = turns[..., 0, :, :, :] @ about_z(-turn)[..., None, :, :]
-        places = -np.swapaxes(model.poses[..., None, :3, :3], -1, -2)
-        places = np.broadcast_to(places, turns.shape)
-        own = np.concatenate([turns, places], axis=-1)
-        every = np.zeros((*own.shape[:-1], count, len(POSE)))
-        for camera in range(count):
-            every[..., camera, :, :, camera, :] = own[..., camera, :, :, :]
-        return every.reshape(*own.shape[:-1], count * len(POSE))
-
-
-def about_z(angle: FloatArray) -> FloatArray:
-    """Return the rotations about z, (..., 3, 3), by angles (...) [rad]."""
-    c = np.cos(angle)
-    s = np.sin(angle)
-    zero = np.zeros_like(c)
-    rows = [[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def turned(cameras: FloatArray, turn: FloatArray | None) -> FloatArray:
-    """Return poses (..., 1 or k, c, 4, 4) of which the first is turned about its optical axis by (..., k) [rad]."""
-    side_by_side = cameras[..., None, :, :, :]
-    if turn is None:
-        return side_by_side
-    new = np.broadcast_to(side_by_side, (*turn.shape, *cameras.shape[-3:])).copy()
-    first = side_by_side[..., 0, :3, :3]
-    new[..., 0, :3, :3] = first @ about_z(turn)
-    return new
+    def _write_poses(self, motions: FloatArray, turn: FloatArray | None, seen: Seen) -> None:
+        """Write the motions of points with the poses of the cameras, (6 c, 3, p, c, ..., k)."""
+        for camera in range(seen.points.shape[2]):
+            points = seen.points[:, :, camera]
+            x, y, z = (_cross(points, axis) for axis in _identity(points.ndim - 1)[:3])
+            if turn is not None and camera == 0:
+                # δ turns the camera before its own turn: its axes are those of the camera turned back.
+                x, y = _turned(x, y, np.cos(turn), -np.sin(turn))
+            first = len(POSE) * camera
+            own = motions[first : first + len(POSE), :, :, camera]
+            own[:3] = (x, y, z)
+            for motion, axis in zip(own[3:], seen.mount[:3], strict=True):
+                motion[...] = -axis[:, None, camera]
 
 
-def skew(v: FloatArray) -> FloatArray:
-    """Return [v]×, (..., 3, 3), of vectors (..., 3), so that [v]× w = v × w."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+def _mount_in(cameras: FloatArray, turn: FloatArray | None) -> Frame:
+    """Return the frame that cameras are mounted on as each of them sees it, (3, c, ..., k or 1).
+
+    Args:
+        cameras: (..., c, 4, 4), in the frame of the mount.
+        turn: by which the first camera is turned about its optical axis, (..., k) [rad]; None for 0.
+    """
+    rows = np.moveaxis(cameras[..., :3, :], (-2, -1, -3), (0, 1, 2))[..., None]
+    R = rows[:, :3]
+    place = rows[:, 3]
+    if turn is not None:
+        angles = np.zeros((cameras.shape[-3], *turn.shape))
+        angles[0] = turn
+        first, second = _turned(R[:, 0], R[:, 1], np.cos(angles), np.sin(angles))
+        R = np.stack([first, second, np.broadcast_to(R[:, 2], first.shape)], axis=1)
+    x, y, z = R
+    return Frame(x, y, z, -_sum_of((x, y, z), place))
+
+
+def _turned(
+    x: FloatArray, y: FloatArray, cosine: FloatArray, sine: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return two axes after a rotation about the third one."""
+    first = cosine * x + sine * y
+    second = cosine * y - sine * x
+    return first, second
+
+
+def _identity(axes: int) -> Frame:
+    """Return a frame that is seen from itself, with so many axes of length 1 after the coordinates."""
+    x, y, z = np.eye(3).reshape(3, 3, *(1,) * axes)
+    return Frame(x, y, z, np.zeros_like(x))
+
+
+def _reversed_last(array: FloatArray, count: int) -> FloatArray:
+    """Return an array whose first axes are its last ones, in reverse order: (..., k, c, p, 3) for (3, p, c, ..., k)."""
+    source = range(count)
+    return np.moveaxis(array, source, [-1 - axis for axis in source])
+
+
+def _sum_of(
+    vectors: tuple[FloatArray, FloatArray, FloatArray], factors: Iterable[FloatArray | float]
+) -> FloatArray:
+    """Return Σ f v of vectors (3, *)."""
+    total: FloatArray = np.zeros(())
+    for vector, factor in zip(vectors, factors, strict=True):
+        # Most rotations of an arm are about one axis: many factors are 0 or 1.
+        if isinstance(factor, float) and factor == 0.0:
+            continue
+        term = vector
+        if not (isinstance(factor, float) and factor == 1.0):
+            term = factor * vector
+        total = total + term
+    return total
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a × b of vectors (3, *)."""
+    a1, a2, a3 = a
+    b1, b2, b3 = b
+    x = a2 * b3 - a3 * b2
+    y = a3 * b1 - a1 * b3
+    z = a1 * b2 - a2 * b1
+    return np.stack([x, y, z])

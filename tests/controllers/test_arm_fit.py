@@ -11,6 +11,7 @@ from servobench.controllers.stages.arm_fit import (
     Frames,
     added,
     at_latency,
+    squared,
     whitened,
 )
 from servobench.plant.robot.catalogue import find_robot
@@ -96,11 +97,10 @@ def test_whitening_makes_noise_along_the_motion_white():
     lateness, deviation = 0.02, 0.001
     covariance = deviation**2 * np.eye(3) + lateness**2 * np.outer(motion[0, 0], motion[0, 0])
     residuals = np.eye(3)
-    fitted = Fitted(
-        residual=residuals[None], rates=np.zeros((1, 3, 3, 0)), motion=np.repeat(motion, 3, axis=1)
-    )
+    motions = np.repeat(np.swapaxes(motion, -1, -2), 3, axis=-1)
+    fitted = Fitted(residual=residuals[None], rates=np.zeros((1, 0, 3, 3)), motion=motions)
     white, _ = whitened(fitted, np.float64(lateness), np.array([deviation**2]))
-    squares = np.vecdot(white[0], white[0]) / deviation**2
+    squares = squared(white[0]) / deviation**2
     np.testing.assert_allclose(squares, np.diag(np.linalg.inv(covariance)), rtol=1e-9)
 
 
