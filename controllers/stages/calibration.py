@@ -36,7 +36,8 @@ from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
 MEMBERS: Final = 24  # members at first
-MEMBERS_LATER: Final = ((0.6, 8), (2.0, 3))  # [s] and members from then on
+FEWER_MEMBERS: Final = 3  # of which there are fewer from `FIRST_TIME` on
+FIRST_TIME: Final = 0.6  # [s]
 ITERATION_INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
 FIRST_ITERATIONS: Final = 6
 MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
@@ -59,7 +60,9 @@ UNEXPLAINED: Final = 1.6  # [1] residuals in σ from which on new members are tr
 LAST_TRIAL: Final = 30.0  # [s]
 MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
-TRIAL_TIME: Final = 0.25  # [s] from one trial to the next
+CANDIDATES: Final = 8  # new members that are tried at once
+TRIAL_ITERATIONS: Final = 12  # iterations of a trial
+ITERATIONS_A_FRAME: Final = 2  # of them a frame
 
 
 class Known(NamedTuple):
@@ -72,6 +75,14 @@ class Known(NamedTuple):
     jacobian: FloatArray  # the regression's, (..., m, n)
     exposed: FloatArray  # joint position at the exposure, by the regression's delay, (..., n)
     fitted: BoolArray  # (...), whether the members had been fitted
+
+
+class Trial(NamedTuple):
+    """New members, of which the best become members of the ensemble after `TRIAL_ITERATIONS` iterations."""
+
+    members: Members
+    wide: FloatArray  # variance of the residuals with which they begin, (..., E)
+    iterations: IntArray  # made so far, (...); `TRIAL_ITERATIONS` where nothing is tried
 
 
 class CalibrationState(NamedTuple):
@@ -94,7 +105,7 @@ class CalibrationState(NamedTuple):
     used: BoolArray  # (...), whether the arm is believed
     passed: IntArray  # frames since the last iteration, (...)
     spawned: IntArray  # members begun so far, (...)
-    tried: FloatArray  # [s] time of the last trial of new members, (...)
+    trial: Trial
     past: tuple[Known, ...]  # the last `HORIZON` frames, the oldest first
 
 
@@ -155,7 +166,11 @@ class Calibration:
             used=no,
             passed=zero,
             spawned=zero + MEMBERS,
-            tried=none,
+            trial=Trial(
+                members=fit.spawned(lead, zero, CANDIDATES, none),
+                wide=np.zeros((*lead, CANDIDATES)),
+                iterations=zero + TRIAL_ITERATIONS,
+            ),
             past=(),
         )
 
@@ -183,9 +198,8 @@ class Calibration:
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
         state = state._replace(history=history, travel=travel, elapsed=elapsed)
-        for begin, size in MEMBERS_LATER:
-            if elapsed > begin and state.share.shape[-1] > size:
-                state = self._reduced(state, size)
+        if elapsed > FIRST_TIME and state.share.shape[-1] > FEWER_MEMBERS:
+            state = self._reduced(state, FEWER_MEMBERS)
         past = state.past
         state = branch(
             due, self._learn, state._replace(past=()), observation, regression, past, elapsed, late
@@ -233,8 +247,12 @@ class Calibration:
         state = branch(iterates, self._continued, state, elapsed, level)
         used = self._trusted(state)
         lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
-        new = lost & (time - state.tried > TRIAL_TIME) & (time < LAST_TRIAL)
-        return branch(new, self._tried, state._replace(used=used), elapsed, delay, level)
+        new = lost & (state.trial.iterations == TRIAL_ITERATIONS) & (time < LAST_TRIAL)
+        state = branch(new, self._spawned, state._replace(used=used), elapsed, delay, level)
+        for _ in range(ITERATIONS_A_FRAME):
+            tries = state.trial.iterations < TRIAL_ITERATIONS
+            state = branch(tries, self._tried, state, elapsed, level)
+        return state
 
     def _path(self, history: FloatArray, late: FloatArray | None) -> FloatArray:
         """Return joint positions up to `late` (...) [s] ago, (..., J, n), the newest last."""
@@ -263,19 +281,20 @@ class Calibration:
         self, members: Members, frames: Frames, lateness: FloatArray, noise: FloatArray
     ) -> Members:
         """Return new members after their first iterations, which take noise for larger: wrong arms find their way."""
-        fit = self.fit
-        members = fit.aligned(members, frames)
-        floor = np.square(FLOOR) + np.square(noise)[..., None]
-        residual = fit.residual(members, frames)
-        square = squared(residual)
-        wide = np.maximum(floor, np.median(square, axis=-1) / 3.0)
-        for left in range(FIRST_ITERATIONS):
-            variance = np.maximum(floor, wide * 0.25**left)
-            if left == FIRST_ITERATIONS - 1:
-                variance = np.broadcast_to(floor, wide.shape)
-            fitted = fit.fitted(members, frames)
-            members, _ = fit.iterated(members, frames, fitted, lateness, variance)
+        members, wide = self._placed(members, frames, noise)
+        for made in range(FIRST_ITERATIONS):
+            variance = _annealed_variance(np.asarray(made), wide, noise)
+            fitted = self.fit.fitted(members, frames)
+            members, _ = self.fit.iterated(members, frames, fitted, lateness, variance)
         return members
+
+    def _placed(
+        self, members: Members, frames: Frames, noise: FloatArray
+    ) -> tuple[Members, FloatArray]:
+        """Return members with cameras that fit their arms, and the variance of their residuals, (..., E)."""
+        members = self.fit.aligned(members, frames)
+        square = squared(self.fit.residual(members, frames))
+        return members, np.maximum(_floor(noise), np.median(square, axis=-1) / 3.0)
 
     def _continued(
         self, state: CalibrationState, elapsed: float, noise: FloatArray
@@ -283,8 +302,7 @@ class Calibration:
         """Return the state after an iteration, with weights, biases and the noise of frames that members imply."""
         fit = self.fit
         frames = self._in_use(state, elapsed)
-        floor = np.square(FLOOR) + np.square(noise)[..., None]
-        variance = np.broadcast_to(floor, state.share.shape)
+        variance = np.broadcast_to(_floor(noise), state.share.shape)
         fitted = fit.fitted(state.members, frames)
         members, residual = fit.iterated(state.members, frames, fitted, state.lateness, variance)
         fitted = fitted._replace(residual=residual)
@@ -398,33 +416,41 @@ class Calibration:
         better = state.errors[..., 1] < gate * state.errors[..., 0]
         return np.asarray(state.fitted & better)
 
-    def _tried(
+    def _spawned(
         self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
-        """Return the state with new members in place of the worse half."""
+        """Return the state in which a trial begins."""
+        new = self.fit.spawned(state.travel.shape, state.spawned, CANDIDATES, delay)
+        members, wide = self._placed(new, self._in_use(state, elapsed), noise)
+        trial = Trial(members, wide, np.zeros_like(state.trial.iterations))
+        return state._replace(trial=trial, spawned=state.spawned + CANDIDATES)
+
+    def _tried(
+        self, state: CalibrationState, elapsed: float, noise: FloatArray
+    ) -> CalibrationState:
+        """Return the state after an iteration of a trial."""
         fit = self.fit
+        trial = state.trial
+        frames = self._in_use(state, elapsed)
+        variance = _annealed_variance(trial.iterations, trial.wide, noise)
+        fitted = fit.fitted(trial.members, frames)
+        members, _ = fit.iterated(trial.members, frames, fitted, state.lateness, variance)
+        trial = trial._replace(members=members, iterations=trial.iterations + 1)
+        state = state._replace(trial=trial)
+        return branch(trial.iterations == TRIAL_ITERATIONS, self._joined, state)
+
+    def _joined(self, state: CalibrationState) -> CalibrationState:
+        """Return the state with the best of the old members and of those that were tried."""
         size = state.share.shape[-1]
-        count = size // 2
-        order = np.argsort(state.members.cost, axis=-1)
-        kept = order[..., : size - count]
-        new = fit.spawned(state.travel.shape, state.spawned, count, delay)
-        new = self._annealed(new, self._in_use(state, elapsed), state.lateness, noise)
-
-        def joined(old: FloatArray, fresh: FloatArray) -> FloatArray:
-            return np.concatenate([pick(old, kept, axes=1), fresh], axis=len(state.travel.shape))
-
-        members = Members(*(joined(*each) for each in zip(state.members, new, strict=True)))
-        nothing = np.zeros((*state.travel.shape, count))
-        share = np.concatenate([pick(state.share, kept, axes=1), nothing], axis=-1)
-        total = np.add.reduce(share, axis=-1)[..., None]
-        bias = joined(state.bias, np.zeros((*nothing.shape, self._m)))
-        return state._replace(
-            members=members,
-            share=share / np.maximum(total, 1e-12),
-            bias=bias,
-            spawned=state.spawned + count,
-            tried=np.full_like(state.tried, elapsed)[()],
-        )
+        axis = state.travel.ndim
+        nothing = np.zeros((*state.travel.shape, CANDIDATES))
+        pairs = zip(state.members, state.trial.members, strict=True)
+        members = Members(*(np.concatenate(pair, axis=axis) for pair in pairs))
+        share = np.concatenate([state.share, nothing], axis=-1)
+        no_bias = np.zeros((*nothing.shape, self._m))
+        bias = np.concatenate([state.bias, no_bias], axis=axis)
+        more = state._replace(members=members, share=share, bias=bias)
+        return self._reduced(more, size)
 
     def _reduced(self, state: CalibrationState, size: int) -> CalibrationState:
         """Return the state with the best members alone, as many as `size`."""
@@ -512,6 +538,21 @@ class Calibration:
             "regression_error": errors[..., 0],
             "arm_error": errors[..., 1],
         }
+
+
+def _floor(noise: FloatArray) -> FloatArray:
+    """Return the variance of residuals that are but noise, (..., 1)."""
+    variance = np.square(noise) + FLOOR**2
+    return np.asarray(variance[..., None])
+
+
+def _annealed_variance(made: IntArray, wide: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the variance of residuals, (..., E), for new members of which iterations are made (...)."""
+    floor = np.broadcast_to(_floor(noise), wide.shape)
+    share = 0.25 ** made[..., None]
+    annealed = np.maximum(floor, share * wide)
+    first = made[..., None] < FIRST_ITERATIONS - 1
+    return np.asarray(np.where(first, annealed, floor))
 
 
 def _of(
