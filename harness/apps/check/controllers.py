@@ -293,12 +293,14 @@ class ControllerChecks:
 
     def time(self) -> str | None:
         """A step fits into a control period."""
-        typical, longest = float(np.median(self._times)), max(self._times[1:])
+        # Beside other work a machine delays most steps, but not all of them.
+        undisturbed = float(np.quantile(self._times, 0.1))
+        longest = max(self._times[1:])
         period = f"the period of {1e3 * PERIOD:g} ms"
-        if typical > PERIOD:
+        if undisturbed > PERIOD:
             raise CheckFailed(
-                f"a step takes {1e3 * typical:.0f} ms, longer than {period}: a robot would get its commands too late; "
-                "move work to the constructor, or choose a longer run.period"
+                f"a step takes {1e3 * undisturbed:.0f} ms, longer than {period}: "
+                "a robot would get its commands too late; move work to the constructor, or choose a longer run.period"
             )
         if longest > PERIOD:
             return f"a step took {1e3 * longest:.0f} ms, longer than {period}"
