@@ -43,9 +43,9 @@ plants = "kinematic"
 
 
 # They are in no ranking and no stored table.
-UNGRADED = {
-    f"{world}_{task}" for world in ("zeros180", "unknown_arm") for task in ("tour", "again")
-}
+LATER = {f"{world}_{task}" for world in ("zeros180", "unknown_arm") for task in ("tour", "again")}
+STAMPED = {"jitter_stamped", "latency_swing_stamped"}
+UNGRADED = LATER | STAMPED
 
 
 @pytest.mark.parametrize("name", challenge_names())
@@ -219,7 +219,18 @@ def test_scores_of_sequences_are_of_their_later_moves_whether_or_not_the_first_o
     np.testing.assert_allclose(own["reference"], [0.4, 3.0, 1.0, 1.0])
 
 
-@pytest.mark.parametrize("name", sorted(UNGRADED))
+@pytest.mark.parametrize("name", sorted(STAMPED))
+def test_a_world_with_stamps_differs_from_that_without_by_them_alone(name):
+    own = find_challenge(name)
+    without = find_challenge(name.removesuffix("_stamped"))
+    same = ("task", "mismatch", "measure", "reference", "plants", "period", "latency", "noise")
+    for key in same:
+        assert getattr(own, key) == getattr(without, key), key
+    assert own.settings == {"plant.sensing.stamps": True}
+    assert without.settings == {}
+
+
+@pytest.mark.parametrize("name", sorted(LATER))
 def test_a_world_of_later_moves_differs_from_that_of_single_ones_by_task_and_measure_alone(name):
     own = find_challenge(name)
     world, _, task = name.rpartition("_")
@@ -230,7 +241,7 @@ def test_a_world_of_later_moves_differs_from_that_of_single_ones_by_task_and_mea
         assert getattr(own, key) == getattr(single, key), key
 
 
-def test_the_challenges_without_a_grade_are_those_of_later_moves():
+def test_the_challenges_without_a_grade_are_those_of_later_moves_and_of_stamps():
     graded = choose_challenges(challenge_names(), GRADES)
     assert set(challenge_names()) - {each.name for each in graded} == UNGRADED
 
