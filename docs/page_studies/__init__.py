@@ -9,13 +9,13 @@ from page_studies.noise import NOISE_STUDIES
 from page_studies.physical import DYNAMICS, ENDS, LONG, RATES_STUDY
 from page_studies.pictures import PERFORMANCE, README
 from page_studies.robustness import MAP, MAP_ENGINES
-from page_studies.worlds import CHALLENGES, LEARNING, PAIRS_STUDY, SENSING, WORLDS
+from page_studies.worlds import CHALLENGES, LEARNED, LEARNING, PAIRS_STUDY, SENSING, WORLDS
 
 STUDIES = {
     study.name: study
     for study in (
         CHALLENGES, HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, CLAIMS, CLAIMS_ENGINES, RATES_STUDY, LONG, ENDS,
-        DYNAMICS, WORLDS, LAB, LEARNING, PAIRS_STUDY, SENSING, MAP, MAP_ENGINES, README, FAILURES,
+        DYNAMICS, WORLDS, LAB, LEARNED, LEARNING, PAIRS_STUDY, SENSING, MAP, MAP_ENGINES, README, FAILURES,
         PERFORMANCE, *NOISE_STUDIES,
     )
 }  # fmt: skip

@@ -11,7 +11,11 @@ import pandas as pd
 from page_studies import cells
 from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.methods import ESTIMATORS, LAWS
-from servobench.harness.analysis.comparison import column_of, median_with_interval
+from servobench.harness.analysis.comparison import (
+    column_of,
+    mean_with_interval,
+    median_with_interval,
+)
 from servobench.harness.apps.studies.challenge import MEASURES
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import flatten
@@ -25,6 +29,20 @@ MISMATCHES = (
 )
 MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
+# A camera that deviates or turns; an arm that does; frames that are late; everything
+LEARNED_IN = (
+    "severe",
+    "turning_camera",
+    "gears50",
+    "zeros90",
+    "unknown_arm_tour",
+    "backlash",
+    "jitter",
+    "all_at_once",
+)
+LEARNED_BY = ("regression_mfac", "ukf_mpc", "rbfnn_mfac", "calibrating_mfac", "revealed")
+# From the hash of the last commit that changed code before they were drawn: c362a
+LEARNED_SEEDS = "800298:800498"
 FRESH = "140428:140628"  # from the hash of the last commit that changed code before they were drawn
 _UKF = {"aids.model": "nominal", "estimator.walk": "1e-12", "estimator.initial_deviation": "1e-12"}
 # Settings without which a method keeps the Jacobian of the nominal model
@@ -106,6 +124,30 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
     }
 
 
+def with_interval(scores: pd.Series[float]) -> str:
+    """Return the mean of scores with its interval, and the share of runs that are not lost."""
+    share = 100.0 * (scores > 0.0).mean()
+    return f"{cells.short(mean_with_interval(scores.to_numpy()), 2)} ({share:.0f} %)"
+
+
+def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the scores of what is known or learned in eight worlds, a row a world."""
+    scores = pd.read_csv(folder / "runs" / "scores.csv")
+    rows = []
+    for name in LEARNED_IN:
+        runs = scores[scores["challenge"] == name]
+        by_method = dict(iter(runs.groupby("controller")["score"]))
+        published = [each for each in by_method if each.endswith(SUFFIX)]
+        best = max(published, key=lambda each: by_method[each].mean())
+        unit = MEASURES[runs["measure"].iloc[0]].unit
+        row = {"world": f"`{name}`", "best as published": with_interval(by_method[best])}
+        for method in LEARNED_BY:
+            row[cells.quoted(method)] = with_interval(by_method[method])
+        reference = runs["reference"].iloc[0]
+        rows.append(row | {"reference": f"{reference:.2f} {unit}"})
+    return {"learned": pd.DataFrame(rows)}
+
+
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how the runs of every pair of law and estimator ended."""
     shown = {
@@ -150,10 +192,10 @@ def sensing_tables(folder: Path) -> dict[str, pd.DataFrame]:
     return tables
 
 
-def suite(controllers: Iterable[str], seeds: str, reference_seeds: str) -> Words:
-    """Return the arguments of a suite of all challenges."""
+def suite(controllers: Iterable[str], seeds: str, reference_seeds: str, *options: str) -> Words:
+    """Return the arguments of a suite of all challenges, or of those that options name."""
     names = ("--plants", "kinematic", "--controllers", ",".join(controllers))
-    return ("suite", *names, "--seeds", seeds, "--reference-seeds", reference_seeds)
+    return ("suite", *names, "--seeds", seeds, "--reference-seeds", reference_seeds, *options)
 
 
 LEARNING_SUITE: Final = suite(FROZEN, "489414:489454", "10")
@@ -189,6 +231,21 @@ CHALLENGES = Study(
     25,
     {"runs": suite(RENDERED, FRESH, "50")},
     challenges_tables,
+)
+LEARNED = Study(
+    "learned",
+    "what a method reaches by what it knows or learns: 200 robots in eight worlds, 50 with references",
+    20,
+    {
+        "runs": suite(
+            (*LEARNED_BY, *(name for name in RENDERED if name.endswith(SUFFIX))),
+            LEARNED_SEEDS,
+            "50",
+            "--challenges",
+            ",".join(LEARNED_IN),
+        )
+    },
+    learned_table,
 )
 PAIRS_STUDY = Study(
     "pairs",
