@@ -23,9 +23,9 @@ from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.networks.rbf import JacobianNetwork
+from servobench.harness.apps.figures import style
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import default_config
-from servobench.harness.pictures import style
 from servobench.harness.run.episode import carry_out_together
 from servobench.plant.contract.signals import Observation, PlantSpec, trusted_observation
 

@@ -16,7 +16,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from measuring import METHODS, PERIODS, QUICK, WIDTH, options, resolved_runs, table, write_picture
-from servobench.harness.pictures import style
+from servobench.harness.apps.figures import style
 from servobench.harness.run import episode, log
 from servobench.harness.run.experiment import build
 from servobench.plant.bench.bench import Bench

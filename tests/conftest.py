@@ -107,7 +107,7 @@ def _floating_point_errors_raise():
 @pytest.fixture
 def no_figures(monkeypatch):
     """Let commands draw no figures, which takes seconds."""
-    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
+    monkeypatch.setattr("servobench.harness.apps.figures.figures.draw_figures", lambda _: [])
 
 
 @pytest.fixture

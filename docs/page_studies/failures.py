@@ -22,9 +22,9 @@ from scipy.stats import rankdata
 from page_studies.cells import by_method, ended_early, quoted, rows_by_method, settled
 from page_studies.study import FIVE, Study, Words, settings, sweep
 from servobench.harness.analysis.comparison import settling_times, success_rate
+from servobench.harness.apps.figures.style import figure_style, method_styles, plain_logarithms
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import Settings
-from servobench.harness.pictures.style import figure_style, method_styles, plain_logarithms
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections, select
 from servobench.harness.run.result import COMPLETED

@@ -25,8 +25,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from page_studies.study import Study, Words, settings, sweep
+from servobench.harness.apps.figures import style
 from servobench.harness.batch.results import load_runs
-from servobench.harness.pictures import style
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import find_robot

@@ -9,12 +9,12 @@ from pathlib import Path
 from PIL import Image
 
 from page_studies.study import FIVE, Study
+from servobench.harness.apps.figures.figures import Choice, folder_figures
+from servobench.harness.apps.figures.style import drawing_of
 from servobench.harness.apps.films.film import draw_frame
 from servobench.harness.apps.films.replay import logged_run
 from servobench.harness.batch import results
 from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.pictures.figures import Choice, folder_figures
-from servobench.harness.pictures.style import drawing_of
 
 SHOWN = "circle"  # the task whose film gives a frame
 PERIOD = 150  # of the run shown: three quarters of a lap

@@ -40,13 +40,14 @@ APPLICATIONS: Final = {
     "studies": Application(
         "claims, challenges and the robustness map", ("robustness", "suite", "claims")
     ),
+    "figures": Application("pictures of a results folder, drawn from its tables", ("figures",)),
     "films": Application("films and snapshots of runs", ("record",), "animation"),
     "report": Application("a page about a results folder", ("report",), "report"),
     "loops": Application("loops at rest: margins and limits", ("analyse",)),
 }
 CORE: Final = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),
-    "results": ("statistics", "figures", "collect", "export", "verify"),
+    "results": ("statistics", "collect", "export", "verify"),
     "lists": ("plants", "controllers", "tasks", "sensing", "init"),
 }
 PANELS: Final = {  # title on the help page -> commands, in the order of first use
@@ -67,9 +68,14 @@ def home_of(name: str) -> str:
     return homes[name]
 
 
+def find_function(command: str, name: str) -> Any:  # noqa: ANN401 - of any kind
+    """Return a function beside a command, for another command; its module is imported."""
+    return getattr(import_module(home_of(command)), name)
+
+
 def find_command(name: str) -> Any:  # noqa: ANN401 - a function, or a group of typer
     """Return the function of a command, or the group of commands of this name; its module is imported."""
-    return getattr(import_module(home_of(name)), name)
+    return find_function(name, name)
 
 
 def assemble(called: str, callback: Callable[..., None]) -> typer.Typer:

@@ -1,4 +1,4 @@
-"""The commands on results folders: `statistics | figures | collect | export | verify`; the verdict on failed runs."""
+"""The commands on results folders: `statistics | collect | export | verify`; the verdict on failed runs."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import (
     FAILED,
-    console,
     print_json,
     print_markdown,
     print_tables,
     say,
 )
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, writing_together
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,81 +80,6 @@ def statistics(
     else:
         print_tables(tables)
     say(describe_controllers(opened.manifest))
-
-
-def figures(
-    folder: Annotated[
-        Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")
-    ],
-    kind: Annotated[
-        str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")
-    ] = "all",
-    controllers: Annotated[
-        str, option("NAMES", "Comma-separated names; default: all of the folder.")
-    ] = "all",
-    names: Annotated[
-        str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")
-    ] = "",
-    width: Annotated[
-        str, option("LENGTH", "Width of a column of a paper, such as 252pt, 89mm or 3.5in.")
-    ] = "7.2in",
-    title: Annotated[bool, switch("--title/--no-title", "Write a title above each figure.")] = True,
-    format_: Annotated[
-        str,
-        named_option(
-            "--format",
-            "NAMES",
-            "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).",
-        ),
-    ] = "pdf",
-    out: Annotated[
-        Path | None, option("FOLDER", "Folder of the figures; default: figures in the folder.")
-    ] = None,
-) -> None:
-    """Draw figures of a folder for a paper.
-
-    They are those of the report, with chosen kinds, controllers, names and width; nothing is simulated for them.
-    """
-    from servobench.harness.batch.results import ResultsFolder
-    from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
-    from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
-
-    formats = selection.split_names("format", format_, ALL_FORMATS)
-    kinds = selection.split_names("kind", kind, tuple(KINDS))
-    opened = ResultsFolder(folder)
-    runs = opened.runs()
-    opened.check_runs(runs)
-    known = list(dict.fromkeys(runs["controller"]))
-    shown = selection.split_names("controllers", controllers, known)
-    own = [name.strip() for name in names.split(",")] if names else shown
-    if len(own) != len(shown):
-        raise ConfigurationError(
-            f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}"
-        )
-    if len(set(own)) < len(own):
-        raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
-    if "pgf" in formats:
-        check_tex()
-    say(opened.describe_missing())
-    choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
-    target = out or folder / FOLDER
-    files = []
-    with (
-        console.status("drawing the figures"),
-        accessing(target),
-        writing_together(target) as partial,
-    ):
-        for named in folder_figures(opened, choice):
-            made = save_figure(named.figure, partial / named.stem, formats, exact_width=True)
-            files += [target / path.name for path in made]
-    if not files:
-        opened.check_steps()
-        raise ConfigurationError(
-            f"{folder} has no figure of {', '.join(kinds)}: errors and paths are of moves, tracking is of curves, "
-            "settling, effort and smoothness are of several runs"
-        )
-    opened.vouch(files)
-    say("\n".join(map(str, files)))
 
 
 def collect(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.applications import find_command
+from servobench.harness.cli.applications import find_command, find_function
 from servobench.harness.cli.options import (
     CONTROLLER,
     ESTIMATOR,
@@ -275,10 +275,9 @@ def _carry_out(
         if out is None:
             point_latest(folder)
         if with_figures:
-            from servobench.harness.pictures.figures import draw_figures
-
+            draw = find_function("figures", "draw")
             with console.status("drawing the figures"):
-                figures = draw_figures(opened)
+                figures = draw(opened)
                 opened.vouch(figures)
         say(
             f"tables and {len(figures)} figures in {folder}"

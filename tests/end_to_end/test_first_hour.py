@@ -124,7 +124,7 @@ def reader(monkeypatch, tmp_path):
     monkeypatch.chdir(folder)
     if not NIGHTLY:
         monkeypatch.setattr("servobench.harness.batch.blocks.available_processors", lambda: 1)
-        monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
+        monkeypatch.setattr("servobench.harness.apps.figures.figures.draw_figures", lambda _: [])
         monkeypatch.setattr(
             "servobench.harness.apps.report.page.write_report",
             lambda made, _: made.path / results.RUNS,

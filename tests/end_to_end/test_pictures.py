@@ -23,20 +23,16 @@ from kit.folders import (
     write_folder,
 )
 from servobench.harness.analysis.comparison import FROM_TWIN, split_tasks
-from servobench.harness.apps.report.page import path_views
-from servobench.harness.batch import results
-from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.config.registry import CONTROLLERS as KNOWN
-from servobench.harness.pictures import style
-from servobench.harness.pictures.figures import (
+from servobench.harness.apps.figures import style
+from servobench.harness.apps.figures.figures import (
     KINDS,
     Choice,
     draw_figures,
     folder_figures,
     page_figures,
 )
-from servobench.harness.pictures.measures import draw_conditions
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.measures import draw_conditions
+from servobench.harness.apps.figures.style import (
     ENDED,
     NARROW,
     TEXT,
@@ -47,7 +43,11 @@ from servobench.harness.pictures.style import (
     fitted,
     method_styles,
 )
-from servobench.harness.pictures.tracks import Track, load_groups
+from servobench.harness.apps.figures.tracks import Track, load_groups
+from servobench.harness.apps.report.page import path_views
+from servobench.harness.batch import results
+from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.plant.contract.checksums import write_vouched
 
 OTHERS = [f"method_{i}" for i in range(20)]

@@ -13,9 +13,9 @@ from servobench.harness.analysis.folder import (
     describe_settings,
 )
 from servobench.harness.analysis.verdict import leaders
+from servobench.harness.apps.figures.measures import FIGURES
 from servobench.harness.batch import results, store
 from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.pictures.measures import FIGURES
 from servobench.harness.run.metrics import METRICS
 
 

@@ -27,6 +27,9 @@ from servobench.harness.analysis.tables import (
     summary_tables,
 )
 from servobench.harness.analysis.verdict import judge, leaders
+from servobench.harness.apps.figures.measures import draw_conditions
+from servobench.harness.apps.figures.style import method_styles
+from servobench.harness.apps.figures.tracks import load_ensembles, load_groups
 from servobench.harness.apps.report.page import error_curves, path_views
 from servobench.harness.batch import results, store, tables
 from servobench.harness.batch.integrity import examine
@@ -34,9 +37,6 @@ from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.batch.schema import MANIFEST, read_manifest
 from servobench.harness.batch.tables import NEEDED
 from servobench.harness.cli.runs import new_folder
-from servobench.harness.pictures.measures import draw_conditions
-from servobench.harness.pictures.style import method_styles
-from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.checksums import SUMS, write_vouched
 from servobench.plant.contract.faults import ConfigurationError

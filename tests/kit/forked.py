@@ -44,7 +44,7 @@ def _call(blocked, arguments, folder, streams, environment) -> None:
     sys.modules.update(dict.fromkeys(blocked))
     if arguments[0] == "run":  # whose figures take seconds
         figures = SimpleNamespace(draw_figures=lambda _: [], page_figures=None, KINDS={})
-        sys.modules["servobench.harness.pictures.figures"] = figures
+        sys.modules["servobench.harness.apps.figures.figures"] = figures
     sys.argv = ["servobench", *arguments]
     from servobench.harness.cli.main import main
 

@@ -22,15 +22,15 @@ from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.analysis.comparison import FROM_TWIN
-from servobench.harness.apps.films.replay import LoggedRun, Replay, Trail
-from servobench.harness.config.installation import missing_extra
-from servobench.harness.pictures.responses import mark_settling_band
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.responses import mark_settling_band
+from servobench.harness.apps.figures.style import (
     figure_style,
     method_styles,
     plain_logarithms,
     save_figure,
 )
+from servobench.harness.apps.films.replay import LoggedRun, Replay, Trail
+from servobench.harness.config.installation import missing_extra
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.rendered.detection import ByteArray

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from servobench.harness.apps.figures.tracks import Track, track_of, values_drawn
 from servobench.harness.config.registry import rendered_plant
-from servobench.harness.pictures.tracks import Track, track_of, values_drawn
 from servobench.harness.run.request import OWN_ROBOT
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray

@@ -12,9 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.apps.loops.loop_analysis import LoopAnalysis
-from servobench.harness.apps.loops.systems import largest_gain, loci, sensitivity
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.style import (
     add_legend,
     drawing_of,
     figure_style,
@@ -22,6 +20,8 @@ from servobench.harness.pictures.style import (
     plain_logarithms,
     save_figure,
 )
+from servobench.harness.apps.loops.loop_analysis import LoopAnalysis
+from servobench.harness.apps.loops.systems import largest_gain, loci, sensitivity
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_atomically
 

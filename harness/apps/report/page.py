@@ -28,10 +28,9 @@ from servobench.harness.analysis.folder import (
     titled_runs,
 )
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.pictures.figures import KINDS, page_figures
-from servobench.harness.pictures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
-from servobench.harness.pictures.tracks import (
+from servobench.harness.apps.figures.figures import KINDS, page_figures
+from servobench.harness.apps.figures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
+from servobench.harness.apps.figures.tracks import (
     ERROR_COLUMNS,
     Shown,
     Tracks,
@@ -40,6 +39,7 @@ from servobench.harness.pictures.tracks import (
     load_tracks,
     longest,
 )
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.variations import varied_columns
@@ -98,7 +98,7 @@ TABLET_COLUMNS: Final = 8
 class Picture(NamedTuple):
     """A figure of the page."""
 
-    kind: str  # a key of `servobench.harness.pictures.figures.KINDS`
+    kind: str  # a key of `servobench.harness.apps.figures.figures.KINDS`
     title: str  # alternative text
     tasks: tuple[str, ...]  # the tasks that it shows; empty if it shows all
     wide: Drawing  # for a sheet of paper, a notebook and most screens

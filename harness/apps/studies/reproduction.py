@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import NO_ESTIMATE
+from servobench.harness.apps.figures.measures import draw_places
+from servobench.harness.apps.figures.style import figure_style, method_styles, save_figure
 from servobench.harness.apps.studies.claims import (
     MAIN,
     UNDECIDED,
@@ -28,8 +30,6 @@ from servobench.harness.batch.lock import locked
 from servobench.harness.batch.plan import MAX_SEEDS
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import find_plant
-from servobench.harness.pictures.measures import draw_places
-from servobench.harness.pictures.style import figure_style, method_styles, save_figure
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_text, write_atomically
 

@@ -18,14 +18,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis import comparison
+from servobench.harness.apps.figures import style
+from servobench.harness.apps.figures.measures import Curves, draw_curves, same_curves
 from servobench.harness.apps.loops.loop_analysis import latency_border
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.settings import Settings, default_config
-from servobench.harness.pictures import style
-from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.variations import Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING

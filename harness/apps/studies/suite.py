@@ -25,12 +25,12 @@ from servobench.harness.analysis.comparison import (
     success_rate,
 )
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
+from servobench.harness.apps.figures import style
 from servobench.harness.apps.studies.challenge import MEASURES, Challenge
 from servobench.harness.apps.studies.scores import profile, ranking, resolution, scores
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
 from servobench.harness.config.settings import Settings
-from servobench.harness.pictures import style
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.request import UNFIT_FOR_FILES
 from servobench.harness.run.resolution import check_settings, resolve_sections, select

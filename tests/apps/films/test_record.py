@@ -17,12 +17,12 @@ from PIL import Image
 from kit.command import finish, servobench, start, wait_for
 from kit.own import CELL, PLAIN_CELL, write
 from kit.plants import NEEDS_BULLET
+from servobench.harness.apps.figures.style import method_styles
 from servobench.harness.apps.films import film
 from servobench.harness.apps.films.replay import Replay, Trail, logged_run, stretch
 from servobench.harness.batch import store
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
-from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError

@@ -10,10 +10,10 @@ import pytest
 from kit.browser import browser_page, find_browser
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.controllers.methods import METHODS
+from servobench.harness.apps.figures.style import NARROW, TEXT, WIDE, method_styles
 from servobench.harness.apps.report import page as report
 from servobench.harness.batch import store
 from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.pictures.style import NARROW, TEXT, WIDE, method_styles
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None, reason="no Chromium: the report is not opened in a browser"

@@ -18,7 +18,7 @@ from pandas.api.types import is_numeric_dtype
 
 from servobench.harness.analysis import comparison
 from servobench.harness.analysis.comparison import NO_ESTIMATE, Estimate
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.style import (
     LETTER,
     TEXT,
     WIDE,
@@ -30,7 +30,7 @@ from servobench.harness.pictures.style import (
     panel_grid,
     plain_logarithms,
 )
-from servobench.harness.pictures.tracks import Ensembles
+from servobench.harness.apps.figures.tracks import Ensembles
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns

@@ -3,9 +3,9 @@
 | figure of the paper | shows | here |
 |---|---|---|
 | 4 | errors of the point-to-point moves; the measured features | `draw_moves`, `draw_features` |
-| 5 | paths of these moves in space | `servobench.harness.pictures.paths` |
+| 5 | paths of these moves in space | `servobench.harness.apps.figures.paths` |
 | 6 | a tracked curve: error, desired and measured features | `draw_tracking` |
-| 7 | the tracked curve in space | `servobench.harness.pictures.paths` |
+| 7 | the tracked curve in space | `servobench.harness.apps.figures.paths` |
 | 8 | the arm at eight places on the circle | `servobench.harness.apps.films.film` |
 """
 
@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import offset_copy
 
 from servobench.harness.analysis.comparison import handy_unit
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.style import (
     CAMERA_MOVES,
     DESIRED,
     JOINTS,
@@ -38,7 +38,7 @@ from servobench.harness.pictures.style import (
     panel_grid,
     plain_logarithms,
 )
-from servobench.harness.pictures.tracks import (
+from servobench.harness.apps.figures.tracks import (
     BAND,
     WINDOW,
     Ensemble,

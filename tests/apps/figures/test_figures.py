@@ -13,12 +13,10 @@ from kit.command import no_file_above
 from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import Estimate
-from servobench.harness.batch import results, store
-from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
-from servobench.harness.pictures.paths import draw_paths
-from servobench.harness.pictures.responses import draw_joint_motion, draw_moves, draw_tracking
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.measures import draw_measures, draw_step_times, same_curves
+from servobench.harness.apps.figures.paths import draw_paths
+from servobench.harness.apps.figures.responses import draw_joint_motion, draw_moves, draw_tracking
+from servobench.harness.apps.figures.style import (
     SETTLED,
     divisions,
     figure_style,
@@ -26,7 +24,9 @@ from servobench.harness.pictures.style import (
     panel_grid,
     save_figure,
 )
-from servobench.harness.pictures.tracks import Track, load_ensembles, quantile, shown_until
+from servobench.harness.apps.figures.tracks import Track, load_ensembles, quantile, shown_until
+from servobench.harness.batch import results, store
+from servobench.harness.batch.results import ResultsFolder
 
 STYLES = method_styles(METHODS)
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.style import (
     DESIRED,
     LETTER,
     WIDE,
@@ -23,7 +23,7 @@ from servobench.harness.pictures.style import (
     mark_end,
     way_along,
 )
-from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
+from servobench.harness.apps.figures.tracks import Track, Tracks, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
 COLUMNS: Final = 2

@@ -12,22 +12,21 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.folder import titled_runs
-from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.pictures.measures import (
+from servobench.harness.apps.figures.measures import (
     FIGURES,
     draw_conditions,
     draw_measures,
     draw_step_times,
 )
-from servobench.harness.pictures.paths import draw_paths
-from servobench.harness.pictures.responses import (
+from servobench.harness.apps.figures.paths import draw_paths
+from servobench.harness.apps.figures.responses import (
     draw_features,
     draw_jacobians,
     draw_joint_motion,
     draw_moves,
     draw_tracking,
 )
-from servobench.harness.pictures.style import (
+from servobench.harness.apps.figures.style import (
     NARROW,
     TEXT,
     WIDE,
@@ -38,7 +37,7 @@ from servobench.harness.pictures.style import (
     method_styles,
     save_figure,
 )
-from servobench.harness.pictures.tracks import (
+from servobench.harness.apps.figures.tracks import (
     Ensembles,
     Group,
     load_ensembles,
@@ -46,6 +45,7 @@ from servobench.harness.pictures.tracks import (
     longest,
     shown_until,
 )
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.run.request import UNFIT_FOR_FILES
 
 FOLDER = "figures"

@@ -11,9 +11,9 @@ from kit.folders import made_up_row, sweep
 from servobench.harness.analysis.folder import describe_folder, titled_runs
 from servobench.harness.analysis.latex import latex_tables, methods_paragraph
 from servobench.harness.analysis.tables import statistics_tables
+from servobench.harness.apps.figures.figures import Choice, folder_figures
 from servobench.harness.batch.api import compare
 from servobench.harness.batch.results import ResultsFolder, load_runs, load_steps
-from servobench.harness.pictures.figures import Choice, folder_figures
 
 TABLE = pd.DataFrame(
     {
