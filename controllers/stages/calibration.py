@@ -35,9 +35,9 @@ from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
-MEMBERS: Final = 24  # members at first
-FEWER_MEMBERS: Final = 3  # of which there are fewer from `FIRST_TIME` on
+FIRST_MEMBERS: Final = 24  # members until `FIRST_TIME`
 FIRST_TIME: Final = 0.6  # [s]
+MEMBERS: Final = 3  # members from then on
 ITERATION_INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
 FIRST_ITERATIONS: Final = 6
 MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
@@ -62,7 +62,7 @@ MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underf
 MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
 CANDIDATES: Final = 8  # new members that are tried at once
 TRIAL_ITERATIONS: Final = 12  # iterations of a trial
-ITERATIONS_A_FRAME: Final = 2  # of them a frame
+ITERATIONS_A_FRAME: Final = 2  # iterations of a trial at each frame
 
 
 class Known(NamedTuple):
@@ -142,8 +142,8 @@ class Calibration:
         features = np.zeros((*rows, m))
         paths = np.zeros((*rows, fit.rows, n))
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
-        members = fit.spawned(lead, zero, MEMBERS, none)
-        size = (*lead, MEMBERS)
+        members = fit.spawned(lead, zero, FIRST_MEMBERS, none)
+        size = (*lead, FIRST_MEMBERS)
         periods = self._periods
         if np.isfinite(observation.capture_time).any():
             periods += whole_periods(MAX_LATENESS, self._period)
@@ -154,7 +154,7 @@ class Calibration:
             history=history.copy(),
             frames=frames,
             members=members,
-            share=np.full(size, 1.0 / MEMBERS),
+            share=np.full(size, 1.0 / FIRST_MEMBERS),
             bias=np.zeros((*size, m)),
             fitted=no,
             lateness=none,
@@ -165,7 +165,7 @@ class Calibration:
             errors=np.full((*lead, 2), np.nan),
             used=no,
             passed=zero,
-            spawned=zero + MEMBERS,
+            spawned=zero + FIRST_MEMBERS,
             trial=Trial(
                 members=fit.spawned(lead, zero, CANDIDATES, none),
                 wide=np.zeros((*lead, CANDIDATES)),
@@ -198,8 +198,8 @@ class Calibration:
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
         state = state._replace(history=history, travel=travel, elapsed=elapsed)
-        if elapsed > FIRST_TIME and state.share.shape[-1] > FEWER_MEMBERS:
-            state = self._reduced(state, FEWER_MEMBERS)
+        if elapsed > FIRST_TIME and state.share.shape[-1] > MEMBERS:
+            state = self._reduced(state, MEMBERS)
         past = state.past
         state = branch(
             due, self._learn, state._replace(past=()), observation, regression, past, elapsed, late

@@ -72,7 +72,7 @@ class Seen(NamedTuple):
 
     mount: Frame  # the frame that they are mounted on
     frames: list[Frame]  # the base, the frames after each joint, and the flange
-    points: FloatArray  # of the target, (3, p, c, ..., k)
+    points: FloatArray  # the target's, (3, p, c, ..., k)
 
 
 @final
@@ -273,7 +273,9 @@ class ParametricModel:
 
     def _target(self, frames: list[Frame]) -> Frame:
         """Return the frame that the target is fixed to."""
-        return frames[-1] if self.planned.mount == "fixed" else frames[0]
+        if self.planned.mount == "fixed":
+            return frames[-1]
+        return frames[0]
 
     def _points(self, theta: FloatArray, frames: list[Frame]) -> FloatArray:
         """Return the points of the target, (3, p, c, ..., k)."""
@@ -296,8 +298,10 @@ class ParametricModel:
         motions = np.zeros((n + len(self.names), *points.shape))
         by_joint = motions[:n]
         by_parameter = motions[n:]
-        # Seen from the hand, the target moves the opposite way.
-        sign = 1.0 if self.planned.mount == "fixed" else -1.0
+        sign = 1.0
+        if self.planned.mount == "hand":
+            # Seen from the hand, the target moves the opposite way.
+            sign = -1.0
         gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
         by_gear = by_parameter[self._gears]
         by_zero = by_parameter[self._zeros]

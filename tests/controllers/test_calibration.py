@@ -9,6 +9,7 @@ from kit.lanes import assert_rows_of_single_runs
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.methods import METHODS
+from servobench.controllers.stages import calibration
 from servobench.harness.apps.fmu.products import controller_model
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out
@@ -45,6 +46,22 @@ def test_the_latency_of_frames_is_found():
     }
     steps = carry_out(run("moderate", settings=late, task="random")).steps
     assert steps["diagnostic_calibration_latency"].iloc[-1] == pytest.approx(0.1, abs=0.01)
+
+
+def test_zeros_that_are_all_unknown_are_found_by_new_members_and_never_without(monkeypatch):
+    unknown = "moderate+joint_offsets=180deg"
+    found = carry_out(run(unknown, 88706, task="tour")).steps
+    assert found["jacobian_error"].iloc[-1] < 0.03
+    monkeypatch.setattr(calibration, "LAST_TRIAL", 0.0)
+    without = carry_out(run(unknown, 88706, task="tour")).steps
+    assert without["jacobian_error"].iloc[-1] > 0.1
+
+
+def test_runs_side_by_side_have_equal_bits_while_some_of_them_try_new_members():
+    brief = {"random": {"duration": 2.5}}
+    unknown = "moderate+joint_offsets=180deg"
+    runs = [run(unknown, seed, settings=brief, task="random") for seed in (88700, 88701, 88704)]
+    assert_rows_of_single_runs(runs)
 
 
 @pytest.mark.parametrize("stamps", [{}, {"stamps": True, "jitter": 0.1}])
