@@ -124,27 +124,31 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
     }
 
 
-def with_interval(scores: pd.Series[float]) -> str:
-    """Return the mean of scores with its interval, and the share of runs that are not lost."""
-    share = 100.0 * (scores > 0.0).mean()
-    return f"{cells.short(mean_with_interval(scores.to_numpy()), 2)} ({share:.0f} %)"
+def interval_scored(row: pd.Series[float], scores: pd.Series[float]) -> str:
+    """Return the mean of the scores of a method in a challenge with its interval, and its share of good runs."""
+    mean = cells.short(mean_with_interval(scores.to_numpy()), 2)
+    return f"{mean} ({row['good.value']:.0f} %)"
 
 
 def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the scores of what is known or learned in eight worlds, a row a world."""
-    scores = pd.read_csv(folder / "runs" / "scores.csv")
+    scores = pd.read_csv(folder / "runs" / "scores.csv").dropna(subset=["score"])
+    methods = pd.read_csv(folder / "runs" / "methods.csv")
     rows = []
     for name in LEARNED_IN:
-        runs = scores[scores["challenge"] == name]
-        by_method = dict(iter(runs.groupby("controller")["score"]))
-        published = [each for each in by_method if each.endswith(SUFFIX)]
-        best = max(published, key=lambda each: by_method[each].mean())
-        unit = MEASURES[runs["measure"].iloc[0]].unit
-        row = {"world": f"`{name}`", "best as published": with_interval(by_method[best])}
-        for method in LEARNED_BY:
-            row[cells.quoted(method)] = with_interval(by_method[method])
-        reference = runs["reference"].iloc[0]
-        rows.append(row | {"reference": f"{reference:.2f} {unit}"})
+        own = methods[methods["challenge"] == name].set_index("controller")
+        by_method = dict(iter(scores[scores["challenge"] == name].groupby("controller")["score"]))
+        shown = {
+            method: interval_scored(own.loc[method], by_method[method])
+            for method in own.index
+            if method in by_method
+        }
+        published = own.loc[[method for method in own.index if method.endswith(SUFFIX)]]
+        best = published["score"].idxmax()
+        unit = MEASURES[own["measure"].iloc[0]].unit
+        row = {"world": f"`{name}`", "best as published": shown[best]}
+        row |= {cells.quoted(method): shown[method] for method in LEARNED_BY}
+        rows.append(row | {"reference": f"{own['reference'].iloc[0]:.2f} {unit}"})
     return {"learned": pd.DataFrame(rows)}
 
 
