@@ -135,8 +135,8 @@ def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
     scores = pd.read_csv(folder / "runs" / "scores.csv").dropna(subset=["score"])
     methods = pd.read_csv(folder / "runs" / "methods.csv")
     rows = []
-    for name in LEARNED_IN:
-        own = methods[methods["challenge"] == name].set_index("controller")
+    for name, runs in methods.groupby("challenge", sort=False):
+        own = runs.set_index("controller")
         by_method = dict(iter(scores[scores["challenge"] == name].groupby("controller")["score"]))
         shown = {
             method: interval_scored(own.loc[method], by_method[method])
@@ -146,9 +146,9 @@ def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
         published = own.loc[[method for method in own.index if method.endswith(SUFFIX)]]
         best = published["score"].idxmax()
         unit = MEASURES[own["measure"].iloc[0]].unit
-        row = {"world": f"`{name}`", "best as published": shown[best]}
+        row = {"world": f"`{name}`", "best as published": scored(own.loc[best])}
         row |= {cells.quoted(method): shown[method] for method in LEARNED_BY}
-        rows.append(row | {"reference": f"{own['reference'].iloc[0]:.2f} {unit}"})
+        rows.append(row | {"score 1 is": f"{own['reference'].iloc[0]:.2f} {unit}"})
     return {"learned": pd.DataFrame(rows)}
 
 

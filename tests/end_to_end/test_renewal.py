@@ -249,8 +249,12 @@ def lay_out_suite(folder):
     own = {
         "challenge": "severe", "grade": "I", "measure": "settling", "reference": 0.7, "score": 0.5, "good.value": 99.0,
     }  # fmt: skip
-    methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN))
+    methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN, *worlds.LEARNED_BY))
     pd.DataFrame([{**own, "controller": name} for name in methods]).to_csv(folder / "methods.csv")
+    scores = [
+        {**own, "controller": name, "score": score} for name in methods for score in (0.4, 0.6)
+    ]
+    pd.DataFrame(scores).to_csv(folder / "scores.csv")
     rank = {
         "rank": 1,
         "score.value": 0.5,
