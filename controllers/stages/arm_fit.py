@@ -58,9 +58,8 @@ FIRST_DAMPING: Final = 1e-2  # [1] λ
 DAMPING_FACTORS: Final = (0.2, 8.0)  # [1] of λ after a step that is made, and one that is not
 DAMPINGS: Final = (1e-6, 1e4)  # [1] between which λ lies
 MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
-SUPPORT: Final = np.array(
-    [-1, 0, 1, 2]
-)  # rows on which a spline stands, from the one before an instant
+# Rows that a spline needs, counted from the last one before an instant
+SUPPORT: Final = np.array([-1, 0, 1, 2])
 ROWS: Final = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
 
 
@@ -108,7 +107,7 @@ def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatA
     x = np.clip(last - delay / grid, 0.0, last)
     first = np.minimum(x.astype(np.int_), last - 1)
     u = (x - first)[..., None, None]
-    # A delay is the same for all frames: whole rows of them are taken.
+    # A delay is the same for all frames, so that whole rows of positions are taken.
     rows = np.moveaxis(path, -2, delay.ndim - 1)
     index = np.clip(first[..., None] + SUPPORT, 0, last)
     support = pick(rows, index, axes=2)
@@ -190,7 +189,7 @@ def _whitened(
     lateness: FloatArray,
     variance: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return both of frames that are late."""
+    """Return both for frames that are late."""
     residual, rates = bare
     square = squared(motion)
     unit = motion / np.sqrt(np.maximum(square, 1e-12))[..., None, :]

@@ -81,7 +81,7 @@ class Trial(NamedTuple):
     """New members, of which the best become members of the ensemble after `TRIAL_ITERATIONS` iterations."""
 
     members: Members
-    wide: FloatArray  # variance of the residuals with which they begin, (..., E)
+    variance: FloatArray  # σ² of the residuals with which they begin, (..., E)
     iterations: IntArray  # made so far, (...); `TRIAL_ITERATIONS` where nothing is tried
 
 
@@ -168,7 +168,7 @@ class Calibration:
             spawned=zero + FIRST_MEMBERS,
             trial=Trial(
                 members=fit.spawned(lead, zero, CANDIDATES, none),
-                wide=np.zeros((*lead, CANDIDATES)),
+                variance=np.zeros((*lead, CANDIDATES)),
                 iterations=zero + TRIAL_ITERATIONS,
             ),
             past=(),
@@ -248,7 +248,7 @@ class Calibration:
         used = self._trusted(state)
         lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
         new = lost & (state.trial.iterations == TRIAL_ITERATIONS) & (time < LAST_TRIAL)
-        state = branch(new, self._spawned, state._replace(used=used), elapsed, delay, level)
+        state = branch(new, self._try_more, state._replace(used=used), elapsed, delay, level)
         for _ in range(ITERATIONS_A_FRAME):
             tries = state.trial.iterations < TRIAL_ITERATIONS
             state = branch(tries, self._tried, state, elapsed, level)
@@ -270,31 +270,33 @@ class Calibration:
         self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
         """Return the state with members fitted for the first time."""
-        fit = self.fit
         frames = self._in_use(state, elapsed)
         lead = state.travel.shape
-        members = fit.start(lead, state.share.shape[-1], delay)
-        members = self._annealed(members, frames, state.lateness, noise)
-        return state._replace(members=members, fitted=np.ones_like(state.fitted))
+        members = self.fit.start(lead, state.share.shape[-1], delay)
+        trial = self._begun_trial(members, frames, noise)
+        for _ in range(FIRST_ITERATIONS):
+            trial = self._iterated(trial, frames, state.lateness, noise)
+        return state._replace(members=trial.members, fitted=np.ones_like(state.fitted))
 
-    def _annealed(
-        self, members: Members, frames: Frames, lateness: FloatArray, noise: FloatArray
-    ) -> Members:
-        """Return new members after their first iterations, which take noise for larger: wrong arms find their way."""
-        members, wide = self._placed(members, frames, noise)
-        for made in range(FIRST_ITERATIONS):
-            variance = _annealed_variance(np.asarray(made), wide, noise)
-            fitted = self.fit.fitted(members, frames)
-            members, _ = self.fit.iterated(members, frames, fitted, lateness, variance)
-        return members
-
-    def _placed(
-        self, members: Members, frames: Frames, noise: FloatArray
-    ) -> tuple[Members, FloatArray]:
-        """Return members with cameras that fit their arms, and the variance of their residuals, (..., E)."""
+    def _begun_trial(self, members: Members, frames: Frames, noise: FloatArray) -> Trial:
+        """Return new members with their cameras where these fit their arms, before any iteration."""
         members = self.fit.aligned(members, frames)
         square = squared(self.fit.residual(members, frames))
-        return members, np.maximum(_floor(noise), np.median(square, axis=-1) / 3.0)
+        variance = np.maximum(_floor(noise), np.median(square, axis=-1) / 3.0)
+        return Trial(members, variance, np.zeros(noise.shape, dtype=np.int_)[()])
+
+    def _iterated(
+        self, trial: Trial, frames: Frames, lateness: FloatArray, noise: FloatArray
+    ) -> Trial:
+        """Return new members after an iteration; the first ones take noise for larger, so that wrong arms come near."""
+        fit = self.fit
+        floor = np.broadcast_to(_floor(noise), trial.variance.shape)
+        made = trial.iterations[..., None]
+        annealed = np.maximum(floor, 0.25**made * trial.variance)
+        variance = np.where(made < FIRST_ITERATIONS - 1, annealed, floor)
+        fitted = fit.fitted(trial.members, frames)
+        members, _ = fit.iterated(trial.members, frames, fitted, lateness, variance)
+        return trial._replace(members=members, iterations=trial.iterations + 1)
 
     def _continued(
         self, state: CalibrationState, elapsed: float, noise: FloatArray
@@ -307,12 +309,11 @@ class Calibration:
         members, residual = fit.iterated(state.members, frames, fitted, state.lateness, variance)
         fitted = fitted._replace(residual=residual)
         cost = members.cost
-        state = state._replace(members=members)
         best = cost.argmin(axis=-1)
         excess = cost - np.minimum.reduce(cost, axis=-1)[..., None]
         likelihood = np.exp(np.maximum(-0.5 * excess, MIN_EXPONENT))
         share = likelihood / np.add.reduce(likelihood, axis=-1)[..., None]
-        state = state._replace(members=state.members._replace(cost=cost), share=share)
+        state = state._replace(members=members, share=share)
         residual, _ = whitened(without_rates(fitted), state.lateness, variance)
         there = np.maximum.reduce(frames.weight, axis=-1) > 0.0
         square = squared(residual)
@@ -416,26 +417,20 @@ class Calibration:
         better = state.errors[..., 1] < gate * state.errors[..., 0]
         return np.asarray(state.fitted & better)
 
-    def _spawned(
+    def _try_more(
         self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
         """Return the state in which a trial begins."""
         new = self.fit.spawned(state.travel.shape, state.spawned, CANDIDATES, delay)
-        members, wide = self._placed(new, self._in_use(state, elapsed), noise)
-        trial = Trial(members, wide, np.zeros_like(state.trial.iterations))
+        trial = self._begun_trial(new, self._in_use(state, elapsed), noise)
         return state._replace(trial=trial, spawned=state.spawned + CANDIDATES)
 
     def _tried(
         self, state: CalibrationState, elapsed: float, noise: FloatArray
     ) -> CalibrationState:
         """Return the state after an iteration of a trial."""
-        fit = self.fit
-        trial = state.trial
         frames = self._in_use(state, elapsed)
-        variance = _annealed_variance(trial.iterations, trial.wide, noise)
-        fitted = fit.fitted(trial.members, frames)
-        members, _ = fit.iterated(trial.members, frames, fitted, state.lateness, variance)
-        trial = trial._replace(members=members, iterations=trial.iterations + 1)
+        trial = self._iterated(state.trial, frames, state.lateness, noise)
         state = state._replace(trial=trial)
         return branch(trial.iterations == TRIAL_ITERATIONS, self._joined, state)
 
@@ -544,15 +539,6 @@ def _floor(noise: FloatArray) -> FloatArray:
     """Return the variance of residuals that are but noise, (..., 1)."""
     variance = np.square(noise) + FLOOR**2
     return np.asarray(variance[..., None])
-
-
-def _annealed_variance(made: IntArray, wide: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the variance of residuals, (..., E), for new members of which iterations are made (...)."""
-    floor = np.broadcast_to(_floor(noise), wide.shape)
-    share = 0.25 ** made[..., None]
-    annealed = np.maximum(floor, share * wide)
-    first = made[..., None] < FIRST_ITERATIONS - 1
-    return np.asarray(np.where(first, annealed, floor))
 
 
 def _of(

@@ -375,14 +375,6 @@ class SetupModel(RobotModel):
         """The points of the target, (..., p, 3) m."""
         return self.target
 
-    def rebuilt(self, arm: SerialArm, cameras: FloatArray) -> Self:
-        """Return this model with another arm and its cameras at poses (..., c, 4, 4)."""
-        return replace(self.with_arm(arm), cameras=cameras)
-
-    def with_target(self, points: FloatArray) -> Self:
-        """Return this model with other points of the target, (..., p, 3) m."""
-        return replace(self, target=points)
-
     def measure(self, points: FloatArray) -> FloatArray:
         """Return the features, (..., m), of points in the frame of each camera, (..., c, p, 3) m."""
         return self.setup.measure(points, self.optics)

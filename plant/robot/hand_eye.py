@@ -75,14 +75,6 @@ class RobotModel(ABC):
         """The points of the target, (..., p, 3) m, in the flange frame; with cameras on the hand in the base frame."""
 
     @abstractmethod
-    def rebuilt(self, arm: SerialArm, cameras: FloatArray) -> Self:
-        """Return this model with another arm (`with_arm`) and its cameras at poses (..., c, 4, 4) of the same axes."""
-
-    @abstractmethod
-    def with_target(self, points: FloatArray) -> Self:
-        """Return this model with other points of the target, (..., p, 3) m."""
-
-    @abstractmethod
     def measure(self, points: FloatArray) -> FloatArray:
         """Return the features, (..., m), of the target's points in the frame of each camera, (..., c, p, 3) m."""
 
@@ -261,14 +253,6 @@ class HandEyeModel(RobotModel):
     def marks(self) -> FloatArray:
         """The ball alone, (..., 1, 3) m."""
         return self.arm.tool[..., None, :]
-
-    def rebuilt(self, arm: SerialArm, cameras: FloatArray) -> Self:
-        """Return this model with another arm and the camera at a pose, (..., 1, 4, 4)."""
-        return replace(self, arm=arm, X_BC=cameras[..., 0, :, :])
-
-    def with_target(self, points: FloatArray) -> Self:
-        """Return this model with the ball at another place of the flange, (..., 1, 3) m."""
-        return replace(self, arm=replace(self.arm, tool=points[..., 0, :]))
 
     def measure(self, points: FloatArray) -> FloatArray:
         """Return the ball in the camera frame, (..., 3) m."""

@@ -14,12 +14,12 @@ rotation vector δ in its own frame or moved by d in that of its mount, by
 
     ∂x/∂δ = [x]×                         ∂x/∂d = −R_cᵀ
 
-All of them are computed in the frames of the cameras: the chain begins at the base as a camera sees it. Cameras on the
-hand see it by way of the flange.
+All motions are computed in the frames of the cameras: the chain of joints begins at the base as a camera sees it. For a
+camera on the hand that follows from the pose of the flange.
 
 Arrays have leading axes: an ensemble of robots, or runs side by side, is one model. In here the coordinates x, y and z
-are the first axis of each array and the k joint positions the last one, so that every operation runs along many
-contiguous numbers; matrices of 3 × 3 would cost ten times as much.
+are the first axis of each array and the k joint positions are the last one, so that every operation runs along many
+contiguous numbers; stacks of small matrices cost several times as much.
 """
 
 from collections.abc import Iterable
