@@ -1,13 +1,12 @@
 """Signals end a command as Ctrl-C does, wherever they meet it, and its temporary files with it."""
 
 import asyncio
-import os
 import signal
 import sys
 
 import pytest
 
-from kit.command import finish, start, wait_for
+from kit.command import python
 from kit.folders import comparison
 from servobench.harness.cli.terminal import ending_alike
 
@@ -61,20 +60,35 @@ def test_signals_that_were_ignored_on_entry_stay_ignored_but_ctrl_c():
             signal.signal(number, handler)
 
 
-@pytest.mark.slow
+# The command `servobench`, to which a signal comes as soon as it has written a few files.
+SIGNALLED = """
+import signal, sys
+from servobench.harness.analysis import exports
+from servobench.harness.cli.main import main
+name = sys.argv.pop(1)
+write, written = exports.write_csv, []
+def write_and_meet_a_signal(table, path):
+    write(table, path)
+    written.append(path)
+    if len(written) == 5:
+        signal.raise_signal(signal.Signals[name])
+exports.write_csv = write_and_meet_a_signal
+main()
+"""
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_command_that_is_terminated_leaves_no_temporary_file_and_nothing_that_looks_whole(
     name, tmp_path
 ):
-    folder = comparison(tmp_path / "folder", tuple(f"c{k}" for k in range(150)), ("exp1",))
+    folder = comparison(tmp_path / "folder", tuple(f"c{k}" for k in range(8)), ("exp1",))
     (tmp_path / "temporary").mkdir()
-    process = start(
-        "export", str(folder), "--out", str(tmp_path / "csv"), TMPDIR=str(tmp_path / "temporary")
-    )
-    wait_for(lambda: any(tmp_path.glob("*csv*")) or process.poll() is not None)
-    os.kill(process.pid, signal.Signals[name])
-    code, output = finish(process)
-    assert code == 128 + signal.Signals[name], output
+    ended = python(
+        "-c", SIGNALLED, name, "export", folder, "--out", tmp_path / "csv",
+        TMPDIR=str(tmp_path / "temporary"),
+    )  # fmt: skip
+    output = ended.stdout + ended.stderr
+    assert ended.returncode == 128 + signal.Signals[name], output
     assert output.splitlines()[-1] in ("servobench: terminated", "servobench: interrupted")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["folder", "temporary"]
     assert not any((tmp_path / "temporary").iterdir())
