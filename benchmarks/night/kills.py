@@ -108,7 +108,10 @@ class Sweep:
     def complain(self, code: int) -> str:
         """Return the fault of a call that has ended: a trace, or an end that it should not have."""
         said = self.said()
-        told = code in (0, 1, 130, -1, -2, -3, -9, -15) or "was ended while it started: SIG" in said
+        told = (
+            code in (0, 1, 129, 130, 143, -1, -2, -3, -9, -15)
+            or "was ended while it started: SIG" in said
+        )
         return "" if told and "Traceback" not in said else said[-1500:]
 
 

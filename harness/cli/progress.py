@@ -209,11 +209,12 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
             observer.note(f"{observer.finished_in_all} of {observer.wanted_in_all} runs are there")
     except KeyboardInterrupt:
         observer.close()
-        if not any(folder.rglob("*.parquet")):
+        done = observer.done
+        if any(folder.rglob("*.parquet")):
+            # A last one may be untold
+            done = max(done, sum(map(len, ResultsFolder(folder).finished_runs())))
+        if done == 0:
             raise
-        # A last one may be untold
-        there = sum(map(len, ResultsFolder(folder).finished_runs()))
-        done = max(observer.done, there)
         kept = f"{done} of {observer.total} runs are finished and kept in {folder}"
         end_interrupted(kept, "the same call with --resume and this --out continues")
     finally:

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+import weakref
 from collections.abc import Iterable, Iterator
 from itertools import takewhile
 from textwrap import wrap
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 FAILED = 1  # exit code where a run failed, a check was not passed or answers are different
 INPUT_ERROR = 2  # exit code
 INTERRUPTED = 130  # exit code after Ctrl-C
-SOON = 0.05  # [s] until an interrupt comes again that a destructor has dropped
+SOON = 0.05  # [s] until an interrupt comes again that was lost
 
 # The first columns, by which a row is known.
 KEYS = ("controller", "mismatch", "noise factor", "latency [ms]", "period [ms]", "A − B")
@@ -50,46 +51,68 @@ if (
 console = Terminal(emoji=False)  # `pixel:hand:` is none
 
 
+class _Interrupt(KeyboardInterrupt):
+    """What a signal raises; other than a usual `KeyboardInterrupt`, it can be referred to weakly."""
+
+
 @contextlib.contextmanager
 def ending_alike() -> Iterator[list[int]]:
     """Let SIGTERM and SIGHUP end the command as Ctrl-C does, such that nothing half written and no process is left.
 
-    One of them that was ignored on entry, as below nohup, stays ignored. An interrupt that comes in a destructor, where
-    Python drops it, comes again. The exit code is that of the signal.
+    One of them that was ignored on entry, as below nohup, stays ignored. An interrupt that is lost comes again: Python
+    drops those of destructors, and compiled code (numpy, for instance) clears those that reach it where it tries
+    something out. Whoever catches one therefore ends the command before leaving its `except`. The exit code is that of
+    the signal.
 
     Yields:
         The signals that came.
     """
     caught: list[int] = []
-    dropped: list[object] = []
+    raised: list[weakref.ref[_Interrupt]] = []
     hook = sys.unraisablehook
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         caught.append(number)
-        # That of asyncio, while its loop runs, raises nothing amid a task.
         handler = signal.getsignal(signal.SIGINT)
-        if not callable(handler):
-            raise KeyboardInterrupt
-        handler(signal.SIGINT, frame)
-
-    def report(unraisable: sys.UnraisableHookArgs) -> None:
-        if unraisable.exc_type is not KeyboardInterrupt:
-            hook(unraisable)
+        # That of asyncio, while its loop runs, raises nothing amid a task.
+        if callable(handler) and handler != interrupt:
+            handler(signal.SIGINT, frame)
             return
-        dropped.append(unraisable.exc_type)
+        start()
+
+    def start() -> None:
+        error = _Interrupt()
+        raised.append(weakref.ref(error))
+        signal.setitimer(signal.ITIMER_REAL, SOON)
+        try:
+            raise error
+        finally:
+            del error  # or its own traceback keeps it alive
+
+    def is_lost() -> bool:
+        # One that is on its way, or that a handler or clean-up was called for, is alive.
+        return bool(raised) and raised[-1]() is None
+
+    def look(_number: int, _frame: FrameType | None) -> None:
+        if is_lost():
+            start()
         signal.setitimer(signal.ITIMER_REAL, SOON)
 
-    taken = [
-        each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) != signal.SIG_IGN
-    ]
-    before = {number: signal.signal(number, interrupt) for number in taken}
-    for number in (signal.SIGINT, signal.SIGALRM):  # asyncio knows Ctrl-C by the usual handler
-        before[number] = signal.signal(number, signal.default_int_handler)
+    def report(unraisable: sys.UnraisableHookArgs) -> None:
+        if unraisable.exc_type is not _Interrupt:
+            hook(unraisable)
+
+    handlers = {signal.SIGINT: interrupt, signal.SIGALRM: look}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            handlers[number] = interrupt
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     sys.unraisablehook = report
     try:
         yield caught
-    except SystemExit as stop:
-        if stop.code != INTERRUPTED and not dropped:
+    except (SystemExit, KeyboardInterrupt) as stop:
+        ended = isinstance(stop, SystemExit) and stop.code != INTERRUPTED
+        if ended and not is_lost():
             raise
         raise SystemExit(128 + (caught or [signal.SIGINT])[0]) from None
     finally:
@@ -97,6 +120,16 @@ def ending_alike() -> Iterator[list[int]]:
         sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def interrupting_as_usual() -> Iterator[None]:
+    """Give Ctrl-C its usual handler, by which `asyncio.run` knows that it may put its own in place of it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def print_rows(headings: Iterable[str], rows: Iterable[Iterable[str]]) -> None:

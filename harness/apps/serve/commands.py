@@ -7,7 +7,7 @@ from typing import Annotated
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import PLANT, option, switch
-from servobench.harness.cli.terminal import say
+from servobench.harness.cli.terminal import interrupting_as_usual, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 
 
@@ -50,6 +50,7 @@ def serve(
         except RunFault as fault:
             raise ConfigurationError(f"plant {plant}: {fault}") from fault
         try:
-            asyncio.run(served.serve(address))
+            with interrupting_as_usual():
+                asyncio.run(served.serve(address))
         finally:
             served.rollout.plant.close()

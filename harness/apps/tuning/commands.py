@@ -89,13 +89,13 @@ def tune(
             f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less"
         )
         methods = open_methods(out, plan)
-        interrupted = not _advance(methods, plan, opened)
+        interrupt = _advance(methods, plan, opened)
     if results := write_results(out, methods):
         _print_tuned(results)
     lost = [name for name, tuned in results.items() if tuned.lost]
     if len(results) > len(lost):
         say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
-    if interrupted:
+    if interrupt is not None:
         _end_interrupted(out)
     if lost:
         found = f"no run of {', '.join(lost)} came near its target with any settings, so no values are written"
@@ -147,8 +147,10 @@ def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers
     sys.exit(FAILED)
 
 
-def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> bool:
-    """Advance the studies to their end and show how far they are; return whether they got there."""
+def _advance(
+    methods: Sequence[Method], plan: TuningPlan, workers: Workers
+) -> KeyboardInterrupt | None:
+    """Advance the studies to their end and show how far they are; return what stopped them before, if anything did."""
     from rich.progress import TextColumn
 
     from servobench.harness.apps.tuning.campaign import advance
@@ -167,9 +169,9 @@ def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> b
                 done = sum(each.done for each in methods)
                 text = f"{method.done} of {total} points, best {best}; in all {done} of {total * len(methods)}"
                 bars.reach(shown[method.name], method.done, f"{method.name}: {text}", best=best)
-    except KeyboardInterrupt:
-        return False
-    return True
+    except KeyboardInterrupt as interrupt:
+        return interrupt
+    return None
 
 
 def _print_tuned(results: Mapping[str, TunedValues]) -> None:
