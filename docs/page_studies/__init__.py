@@ -5,6 +5,7 @@ from __future__ import annotations
 from page_studies.claims import CLAIMS, CLAIMS_ENGINES, LAB
 from page_studies.failures import FAILURES
 from page_studies.held_out import AIDS, HELD_OUT, RENDERED_STUDY, TUNING_STUDIES
+from page_studies.knowledge import KNOWN_STUDY
 from page_studies.noise import NOISE_STUDIES
 from page_studies.physical import DYNAMICS, ENDS, LONG, RATES_STUDY
 from page_studies.pictures import PERFORMANCE, README
@@ -15,7 +16,7 @@ STUDIES = {
     study.name: study
     for study in (
         CHALLENGES, HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, CLAIMS, CLAIMS_ENGINES, RATES_STUDY, LONG, ENDS,
-        DYNAMICS, WORLDS, LAB, LEARNED, LEARNING, PAIRS_STUDY, SENSING, MAP, MAP_ENGINES, README, FAILURES,
+        DYNAMICS, WORLDS, LAB, LEARNED, KNOWN_STUDY, LEARNING, PAIRS_STUDY, SENSING, MAP, MAP_ENGINES, README, FAILURES,
         PERFORMANCE, *NOISE_STUDIES,
     )
 }  # fmt: skip

@@ -133,8 +133,43 @@ def interval_scored(row: pd.Series[float], scores: pd.Series[float]) -> str:
     return f"{mean} ({row['good.value']:.0f} %)"
 
 
+def variance_shares(scores: pd.DataFrame) -> dict[str, float]:
+    """Return what share of the variance of scores goes with worlds, methods, both together, robots and what is left.
+
+    It is the analysis of variance of a table of all methods on all robots of all worlds: a robot belongs to its world.
+    """
+    table = scores.pivot_table(index=["challenge", "seed"], columns="controller", values="score")
+    grand = table.to_numpy().mean()
+    by_world = table.groupby("challenge").transform("mean")
+    world = by_world.mean(axis="columns") - grand
+    method = table.mean() - grand
+    both = by_world.sub(world + grand, axis="index") - method
+    robot = table.mean(axis="columns") - world - grand
+    rest = table.sub(robot, axis="index") - by_world
+    count, methods = table.shape
+    squares = {
+        "world": methods * float((world**2).sum()),
+        "method": count * float((method**2).sum()),
+        "method in a world": float((both**2).to_numpy().sum()),
+        "robot": methods * float((robot**2).sum()),
+        "rest": float((rest**2).to_numpy().sum()),
+    }
+    return {name: each / sum(squares.values()) for name, each in squares.items()}
+
+
+def shares_table(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return the shares of variance [%] with and without the method that calibrates, a row a set of methods."""
+    equipped = LEARNED_BY[:3]
+    rows = []
+    for methods in (LEARNED_BY[:2], equipped, (*equipped, "calibrating_mfac")):
+        shares = variance_shares(scores[scores["controller"].isin(methods)])
+        row = {"methods": ", ".join(map(cells.quoted, methods))}
+        rows.append(row | {name: f"{100.0 * share:.1f}" for name, share in shares.items()})
+    return pd.DataFrame(rows)
+
+
 def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the scores of what is known or learned in eight worlds, a row a world."""
+    """Return the scores of what is known or learned in eight worlds, a row a world, and shares of their variance."""
     scores = pd.read_csv(folder / "runs" / "scores.csv").dropna(subset=["score"])
     methods = pd.read_csv(folder / "runs" / "methods.csv")
     rows = []
@@ -152,7 +187,7 @@ def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
         row = {"world": f"`{name}`", "best as published": scored(own.loc[best])}
         row |= {cells.quoted(method): shown[method] for method in LEARNED_BY}
         rows.append(row | {"score 1 is": f"{own['reference'].iloc[0]:.2f} {unit}"})
-    return {"learned": pd.DataFrame(rows)}
+    return {"learned": pd.DataFrame(rows), "learned_shares": shares_table(scores)}
 
 
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:

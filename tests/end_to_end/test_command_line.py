@@ -97,9 +97,8 @@ def test_a_run_without_figures_leaves_its_tables_only(output_of, tmp_path):
 def test_a_command_that_is_started_with_interrupts_ignored_can_be_interrupted():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with ending_alike():
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
+        with ending_alike(), pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)

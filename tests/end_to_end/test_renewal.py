@@ -421,3 +421,32 @@ def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
         assert abs(sum(parts) - whole) < 0.5
     assert "(pictures/performance_shares.png)" in page
     assert (tmp_path / "pictures" / "performance_shares.png").stat().st_size < 100e3
+
+
+def scored_by(value) -> pd.DataFrame:
+    """Return scores of two methods on two robots in each of two worlds, as a function of world, robot and method."""
+    rows = [
+        {"challenge": world, "seed": robot, "controller": method, "score": value(world, robot, method)}
+        for world in (0, 1)
+        for robot in (0, 1)
+        for method in (0, 1)
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (lambda world, robot, method: world, {"world": 1.0}),
+        (lambda world, robot, method: method, {"method": 1.0}),
+        (lambda world, robot, method: world ^ method, {"method in a world": 1.0}),
+        (lambda world, robot, method: world ^ robot, {"robot": 1.0}),
+        (lambda world, robot, method: robot ^ method, {"rest": 1.0}),
+        (lambda world, robot, method: 3 * world + method, {"world": 0.9, "method": 0.1}),
+    ],
+)
+def test_the_variance_of_scores_is_shared_out(value, expected):
+    shares = worlds.variance_shares(scored_by(value))
+    assert {name: share for name, share in shares.items() if share > 1e-12} == pytest.approx(
+        expected
+    )
