@@ -103,7 +103,7 @@ class TwinFile:
     """[1] share of the frames."""
     outlier_size: NonNegative = 0.0
     """[m or px] their usual distance."""
-    plant: dict[str, dict[str, Number]] = field(default_factory=dict)
+    plant: dict[str, dict[str, Number | bool]] = field(default_factory=dict)
     """Further settings of sensing and mechanics, such as backlash."""
     mean: dict[str, Number] = field(default_factory=dict)
     """Parameters by name, but for those of the camera; one that is left out is 0."""

@@ -5,7 +5,8 @@ arrives at t_k, exposed a latency L before, and the joint motion under commands 
 
     y_k = h(q(t_k − L); θ) + ν_k,   ν ~ N(0, Σ)          τ v̇ = u(t − d) − v,   q(t_{k+1}) − q(t_k) = ∫ v dt
 
-with q a cubic spline through the logged positions. θ minimises Σ ρ(‖Σ^{-1/2} ν_k‖²) + Σ (θ_i/s_i)², with a soft L1 loss
+with q a cubic spline through the logged positions. Where frames are stamped, t_k is when they would have come at the
+mean latency L. θ minimises Σ ρ(‖Σ^{-1/2} ν_k‖²) + Σ (θ_i/s_i)², with a soft L1 loss
 ρ while Σ and the outliers are found, and none at last for the frames that are left. s_i are wide priors (`PRIORS`), so
 that directions of θ that no frame tells (the zero of the first joint turns the arm as a turn of the camera does) stay
 at the nominal robot. The posterior is N(θ, c (JᵀΣ⁻¹J/f + S⁻²)⁻¹), where f is the correlation time of the residuals.
@@ -38,6 +39,11 @@ from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
 
 LOG: Final = "the log"  # in error messages
 VELOCITY: Final = COMMAND.removesuffix("_command")  # as commands are misnamed
+CAPTURED: Final = "capture_time_s"  # column with the stamps of frames
+MAX_LATENESS_RANGE: Final = (
+    2.0  # [s] between the latest and the earliest stamped frame, by the rows' clock
+)
+MAX_CLOCK_DRIFT: Final = 0.02  # [s/s] by which the clock of a camera may drift
 MAX_LATENCY: Final = 0.25  # [s]
 LATENCY_STEP: Final = 0.0125  # [s] between latencies of the first search
 MIN_FRAMES: Final = 50
@@ -105,6 +111,12 @@ class Log(NamedTuple):
     features: FloatArray  # (k, m) [unit of the feature]
     valid: BoolArray  # (k,) whether a row has a new frame
     commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
+    frame_time: FloatArray  # (k,) [s] when the frame of a row came, or by its stamp would have come at the mean latency
+
+    @property
+    def lateness(self) -> FloatArray:
+        """By how much each frame came later than at the mean latency, (k,) [s]; 0 without stamps."""
+        return self.time - self.frame_time
 
     def farthest_joint(self) -> tuple[float, str]:
         """Return how far a joint is beyond its range at most [rad], and where that is."""
@@ -204,6 +216,8 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     if "feature_valid" in table:
         marked = numbers_of(LOG, table, ["feature_valid"])[:, 0]
     valid = (marked != 0.0) & ~lost.to_numpy()
+    time = np.asarray(spec.period * rows)
+    frame_time = _frame_times(table, time, valid)
     commands = None
     lacking = [name for name in names[COMMAND] if name not in table]
     if not lacking:
@@ -211,7 +225,7 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     elif any(str(name).startswith(VELOCITY) for name in table):
         missing = ", ".join(lacking)
         remark(f"the log has columns {VELOCITY}_… but no {missing}: commands are left out")
-    log = Log(spec, np.asarray(spec.period * rows), joints, features, valid, commands)
+    log = Log(spec, time, joints, features, valid, commands, frame_time)
     count = len(frames_of(log))
     if count < least:
         after = f"after the first {MAX_LATENCY:g} s"
@@ -220,9 +234,33 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     return log
 
 
+def _frame_times(table: pd.DataFrame, time: FloatArray, valid: BoolArray) -> FloatArray:
+    """Return when the frames of rows came, (k,) s; for stamped ones, when they would have come at the mean latency.
+
+    The camera's clock has an unknown offset, which the mean takes away; its drift is a parameter (`drift`).
+
+    Raises:
+        ConfigurationError: the stamps run faster or slower than the rows, as in another unit.
+    """
+    if CAPTURED not in table:
+        return time
+    captured = table[CAPTURED].to_numpy(np.float64)
+    stamped = valid & np.isfinite(captured)
+    if not stamped.any():
+        return time
+    lateness = (time - captured)[stamped]
+    span = float(np.ptp(time[stamped]))
+    if np.ptp(lateness) > MAX_LATENESS_RANGE + MAX_CLOCK_DRIFT * span:
+        stamps = float(np.ptp(captured[stamped]))
+        raise ConfigurationError(
+            f"{CAPTURED} of {LOG} runs {stamps:.4g} s while its rows run {span:.4g} s: write stamps in seconds"
+        )
+    return np.where(stamped, captured + np.mean(lateness), time)
+
+
 def frames_of(log: Log, most: int = sys.maxsize) -> Any:  # noqa: ANN401 - of indices
     """Return the rows of frames that were exposed within the log at any latency: `most` at most, equally spaced."""
-    rows = np.flatnonzero(log.valid & (log.time >= log.time[0] + MAX_LATENCY))
+    rows = np.flatnonzero(log.valid & (log.frame_time >= log.time[0] + MAX_LATENCY))
     stride = -(-len(rows) // most)  # rounded up
     return rows[:: max(1, stride)]
 
@@ -273,7 +311,7 @@ class Identified:
     def rates(self, log: Log) -> FloatArray:
         """Return how fast the features of these frames move, (k, m), 1/s."""
         predicted = log.features[self.rows] - self.residuals
-        return np.asarray(np.gradient(predicted, log.time[self.rows], axis=0))
+        return np.asarray(np.gradient(predicted, log.frame_time[self.rows], axis=0))
 
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
@@ -285,7 +323,7 @@ class Identified:
         """Return the residuals of all valid frames of a log after the longest latency, (k, m)."""
         rows = frames_of(log)
         latency = self.values[self.names.index("latency")]
-        joints = CubicSpline(log.time, log.joints)(log.time[rows] - latency)
+        joints = CubicSpline(log.time, log.joints)(log.frame_time[rows] - latency)
         features = np.asarray(self.model(nominal).feature(joints))
         return np.asarray(log.features[rows] - features)
 
@@ -343,7 +381,7 @@ class _Problem:
         """Place the camera where the nominal robot, changed by the parameters `begin`, fits a log best."""
         self.log = log
         self.rows = frames_of(log, most)
-        self.time = log.time[self.rows]
+        self.time = log.frame_time[self.rows]
         self.y = log.features[self.rows]
         self.motion = CubicSpline(log.time, log.joints)
         self.middle = float(log.time.mean())
@@ -517,20 +555,10 @@ class _Problem:
         # Cauchy weights, so that outliers count little.
         scaled = late / np.median(np.abs(late))
         weight = np.sqrt(weight / (1.0 + scaled**2))
-        target = late * weight
-        fits: list[tuple[float, float, list[float]]] = []
-        fitting = SWING_PERIODS[np.ptp(self.time) > MIN_SWINGS * SWING_PERIODS]
-        for pace in 2.0 * np.pi / fitting:
-            phase = pace * self.time
-            waves = np.stack([np.sin(phase), np.cos(phase)], axis=1) * weight[:, None]
-            sizes = np.linalg.lstsq(waves, target, rcond=None)[0]
-            left = float(np.sum((target - waves @ sizes) ** 2))
-            fits.append((left, pace, sizes.tolist()))
-        if fits:
-            _, self.pace, best = min(fits)
-            z[swings] = np.array(best) / prior("swing")
-        else:
-            z[swings] = 0.0
+        z[swings] = 0.0
+        if wave := fitted_wave(self.time, late, weight):
+            self.pace, sizes, _ = wave
+            z[swings] = sizes / prior("swing")
         return z
 
     def differences(self, z: FloatArray) -> FloatArray:
@@ -540,6 +568,28 @@ class _Problem:
         turn = Rotation.from_matrix(self.nominal[:3, :3].T @ pose[:3, :3]).as_rotvec()
         values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
         return values
+
+
+def fitted_wave(
+    time: FloatArray, late: FloatArray, weight: FloatArray
+) -> tuple[float, FloatArray, float] | None:
+    """Return the angular frequency [rad/s] whose sine and cosine, of sizes (2,) [s], fit latenesses (k,) [s] best.
+
+    The third number is the share of the weighted squares that is left. None for a log that is too short for any wave.
+    """
+    fits: list[tuple[float, float, list[float]]] = []
+    target = late * weight
+    fitting = SWING_PERIODS[np.ptp(time) > MIN_SWINGS * SWING_PERIODS]
+    for pace in 2.0 * np.pi / fitting:
+        phase = pace * time
+        waves = np.stack([np.sin(phase), np.cos(phase)], axis=1) * weight[:, None]
+        sizes = np.linalg.lstsq(waves, target, rcond=None)[0]
+        left = float(np.sum((target - waves @ sizes) ** 2))
+        fits.append((left, pace, sizes.tolist()))
+    if not fits:
+        return None
+    left, pace, best = min(fits)
+    return pace, np.array(best), left / float(np.sum(target**2))
 
 
 def _sees_pixels(model: RobotModel) -> bool:

@@ -8,7 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
-from servobench.harness.apps.twin.identification import EXTRAS, OUTLIER, Identified, Log
+from servobench.harness.apps.twin.identification import (
+    EXTRAS,
+    OUTLIER,
+    Identified,
+    Log,
+    fitted_wave,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 
@@ -16,6 +22,9 @@ CERTAIN: Final = (
     5.0  # [1] deviations from none that make backlash, ripple, a soft tool and the like certain
 )
 MIN_JITTER: Final = 0.02  # [s] by which frames must be late by changing times
+MAX_WAVE_REST: Final = (
+    0.3  # [1] share of the squares of stamped latenesses that a wave leaves where they swing
+)
 MAX_JITTER: Final = 0.05  # [s] deviation of these times that makes no outliers
 SLOW_SHARE: Final = (
     0.3  # [1] share of the frames, the slowest ones, in which their lateness hardly shows
@@ -95,16 +104,25 @@ def sensor(log: Log, robot: Identified) -> Sensor:
         sensing["camera_turn"] = certain["turning"]
     swing = math.hypot(certain.get("swing_sin", 0.0), certain.get("swing_cos", 0.0))
     lateness = _lateness(log, robot)
+    swing_period = robot.swing_period
+    stamped = log.lateness[robot.rows]
+    if stamped.any():
+        sensing["stamps"] = True
+        wave = fitted_wave(log.frame_time[robot.rows], stamped, np.ones_like(stamped))
+        if wave is not None and wave[-1] < MAX_WAVE_REST:
+            pace, sizes, _ = wave
+            swing = float(np.linalg.norm(sizes))
+            swing_period = 2.0 * math.pi / pace
     waiting = Waiting(0.0, 0.0, 0.0)
     lost = lost_share(log)
     missing = missing_frames(log)
     in_a_row = float(np.median(missing[missing > 0.0])) if missing.any() else 0.0
     if swing > MIN_JITTER:
-        waiting = arrivals(period, 0.0, swing, robot.swing_period)
+        waiting = arrivals(period, 0.0, swing, swing_period)
         # The fit sees the newest frames only, and so a smaller swing.
         ratio = swing / waiting.swing if waiting.swing > MIN_JITTER else 1.0
         sensing["latency_swing"] = swing * ratio
-        sensing["swing_period"] = robot.swing_period
+        sensing["swing_period"] = swing_period
     elif lateness.deviation > MIN_JITTER:
         tried = [(arrivals(period, jitter), jitter) for jitter in JITTERS]
         waiting, jitter = min(tried, key=lambda each: abs(each[0].deviation - lateness.deviation))
@@ -158,7 +176,10 @@ class _Lateness(NamedTuple):
 
 
 def _lateness(log: Log, robot: Identified) -> _Lateness:
-    """Return the lateness of frames, σ² as the slope of ‖e‖² over ‖ẏ‖²."""
+    """Return the lateness of frames: by their stamps, or σ² as the slope of ‖e‖² over ‖ẏ‖²."""
+    stamped = log.lateness[robot.rows]
+    if stamped.any():
+        return _Lateness(float(stamped.std()), robot.noise, robot.inliers)
     speed = np.sum(robot.rates(log) ** 2, axis=1)  # ‖ẏ‖²
     square = np.sum(robot.residuals**2, axis=1)  # ‖e‖²
     slow = robot.inliers & (speed <= np.quantile(speed, SLOW_SHARE))

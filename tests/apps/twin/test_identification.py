@@ -429,7 +429,10 @@ def test_equal_frames_of_a_detector_of_whole_pixels_are_no_mistake(pixel):
 def test_frames_of_a_short_log_and_of_the_same_laps_again_and_again_are_no_mistake():
     log = logged()[0]
     short = log._replace(
-        **{name: getattr(log, name)[:80] for name in ("time", "joints", "features", "valid")}
+        **{
+            name: getattr(log, name)[:80]
+            for name in ("time", "joints", "features", "valid", "frame_time")
+        }
     )
     assert short.frame_mistake() == ""
     lap = 10 + np.arange(len(log.time)) % 60
@@ -516,17 +519,57 @@ WORLDS = {  # mismatch -> section, and settings with the share by which they may
 }
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_a_twin_has_the_gears_the_tool_and_the_lateness_that_a_log_tells(world, tmp_path):
+def excited(world, *, stamps=False):
+    """Return the steps of a run with excited joints in a world."""
     settings = {
         "random": {"duration": 40.0},
         "run": {"lost_after": 20.0},
         "Excite": {"swing": 0.25},
+        "kinematic": {"sensing": {"stamps": stamps}},
     }
     made = run(
         "docs/examples/excite.py", task="random", mismatch=world, seed=SEED, settings=settings
     )
-    log = read_log(logged()[0].spec, made.steps)
+    return made.steps
+
+
+@pytest.mark.parametrize("world", ["jitter=200ms", "latency_swing=100ms"])
+def test_stamps_tell_when_frames_were_exposed_that_are_late_by_changing_times(world, tmp_path):
+    steps = excited(world, stamps=True)
+    spec, nominal = logged()[0].spec, find_robot("ur5").nominal
+    log, unstamped = read_log(spec, steps), read_log(spec, steps.drop(columns="capture_time_s"))
+    robot = identify(log, nominal)
+    sizes = [
+        np.linalg.norm(list(each.sizes().values()))  # The true robot is the nominal one
+        for each in (robot, identify(unstamped, nominal))
+    ]
+    assert sizes[0] < 0.6 * sizes[1]
+    told = sensor(log, robot)
+    _, wanted = WORLDS[world]
+    assert told.settings == {
+        "sensing": {"stamps": True, **{n: pytest.approx(v, rel=s) for n, (v, s) in wanted.items()}}
+    }
+    assert np.sqrt(np.diag(told.noise)) == pytest.approx(0.001, rel=0.1)
+    twin = twin_text(robot, log, command_response(log), ("ur5", "position"))
+    path = write(tmp_path, twin, "twin.toml")
+    brief = {"exp1": {"duration": 1.0}}
+    seen = run("constant", robot=str(path), mismatch="none", settings=brief).steps
+    assert "capture_time_s" in seen
+
+
+def test_stamps_in_another_unit_are_refused():
+    steps = logged()[1]
+    milliseconds = steps.assign(capture_time_s=1e3 * (steps["time_s"] - 0.08))
+    with pytest.raises(
+        ConfigurationError,
+        match="capture_time_s of the log runs 1.995e.04 s while its rows run 19.95 s",
+    ):
+        read_log(logged()[0].spec, milliseconds)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_twin_has_the_gears_the_tool_and_the_lateness_that_a_log_tells(world, tmp_path):
+    log = read_log(logged()[0].spec, excited(world))
     robot = identify(log, find_robot("ur5").nominal)
     told, (section, wanted) = sensor(log, robot), WORLDS[world]
     assert told.settings.keys() == ({section} if section else set())
