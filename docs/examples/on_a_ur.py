@@ -42,7 +42,10 @@ class URConfig:
 
 
 class Served:
-    """Features of `servobench serve`, lines of JSON: `read` returns (m,), whether it is valid, and its time [s]."""
+    """Features of `servobench serve`, lines of JSON.
+
+    `read` returns (m,), whether it is valid, its time [s], and when it was exposed by the camera's clock [s], or NaN.
+    """
 
     def __init__(self, host, patience):
         self.lines = socket.create_connection((host, 30020), timeout=patience).makefile(
@@ -53,11 +56,15 @@ class Served:
         frame = json.loads(self.lines.readline())
         while select([self.lines], [], [], 0.0)[0]:  # the last one, where some wait
             frame = json.loads(self.lines.readline())
-        return np.array(frame["feature"]), all(frame["valid"]), frame["time"]
+        captured = frame.get("capture_time", np.nan)
+        return np.array(frame["feature"]), all(frame["valid"]), frame["time"], captured
 
 
 class ColourBall:
-    """A red ball found with OpenCV: `grab()` returns RGB (h, w, 3), depth (h, w) [m], 0 for none, and a time [s]."""
+    """A red ball found with OpenCV.
+
+    `grab()` returns RGB (h, w, 3), depth (h, w) [m], 0 for none, and when they were exposed by the camera's clock [s].
+    """
 
     def __init__(self, grab, camera, radius):
         self.grab, self.camera, self.radius, self.last = grab, camera, radius, np.zeros(3)
@@ -69,7 +76,7 @@ class ColourBall:
             patch, depth[patch.rows, patch.columns], self.camera, self.radius
         )
         self.last = found.centre if found else self.last
-        return self.last, bool(found), stamp
+        return self.last, bool(found), stamp, stamp
 
 
 class UR(servobench.Plant):
@@ -94,7 +101,7 @@ class UR(servobench.Plant):
 
     def observe(self):
         faulthandler.dump_traceback_later(2.0 + self.patience, exit=True)
-        (feature, valid, shown), self.began, before = (
+        (feature, valid, shown, captured), self.began, before = (
             self.detector.read(),
             time.monotonic(),
             self.before,
@@ -124,7 +131,9 @@ class UR(servobench.Plant):
             shown,
             stamp,
         )
-        self.before = servobench.Observation(self.k * self.spec.period, q, feature, bool(valid))
+        self.before = servobench.Observation(
+            self.k * self.spec.period, q, feature, bool(valid), capture_time=captured
+        )
         return self.before
 
     def step(self, command):

@@ -21,7 +21,7 @@ def folder(tmp_path_factory):
         tasks=["target"],
         seeds=[1],
         out=out,
-        settings={"target": {"duration": 1.0}},
+        settings={"target": {"duration": 1.0}, "kinematic": {"sensing": {"stamps": True}}},
     )
     return out
 
@@ -51,6 +51,7 @@ def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
             (metadata,) = reader.iter_metadata()
             assert metadata.metadata["outcome"] == run["outcome"]
             messages = list(reader.iter_messages(topics=["/feature"]))
+            others = list(reader.iter_messages(topics=["/run"]))
         assert [message.log_time for _, _, message in messages] == [
             k * 50_000_000 for k in range(len(steps))
         ]
@@ -59,6 +60,10 @@ def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
         )
         np.testing.assert_array_equal(
             features, steps[[f"feature_{axis}_m" for axis in "xyz"]].to_numpy()
+        )
+        stamps = [json.loads(each.data)["capture_time_s"] for _, _, each in others]
+        np.testing.assert_array_equal(
+            np.array(stamps, np.float64), steps["capture_time_s"].to_numpy()
         )
         schema, channel, _ = messages[0]
         assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")

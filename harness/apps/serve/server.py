@@ -9,6 +9,7 @@ import base64
 import errno
 import ipaddress
 import json
+import math
 import os
 import struct
 from asyncio import StreamReader, StreamWriter
@@ -505,6 +506,9 @@ class Server:
         seen, channel = self.rollout.observation, self._spec.feature
         frame = {"time": seen.time, "names": channel.names, "unit": channel.unit}
         frame |= {"feature": seen.feature.tolist(), "valid": seen.valid.tolist()}
+        captured = float(seen.capture_time)
+        if math.isfinite(captured):
+            frame["capture_time"] = captured
         lines = {False: frame, True: frame}
         if any(map(self._watchers.get, writers)) and (picture := self._plant.picture()) is not None:
             png = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()

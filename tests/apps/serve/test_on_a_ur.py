@@ -200,8 +200,8 @@ def test_a_colour_ball_is_found_where_it_is_and_missed_where_it_is_not():
     ).reshape(h, w)
     image = np.where(hit.reshape(h, w, 1), np.uint8([200, 20, 20]), np.uint8([90, 90, 90]))
     detector = runpy.run_path(str(EXAMPLE))["ColourBall"]
-    feature, valid, stamp = detector(lambda: (image, depth, 7.0), CAMERA, radius).read()
-    assert (valid, stamp) == (True, 7.0)
+    feature, valid, *stamps = detector(lambda: (image, depth, 7.0), CAMERA, radius).read()
+    assert (valid, stamps) == (True, [7.0, 7.0])
     assert np.abs(feature - ball).max() < 1e-3
-    feature, valid, _ = detector(lambda: (np.zeros_like(image), depth, 7.1), CAMERA, radius).read()
+    feature, valid, *_ = detector(lambda: (np.zeros_like(image), depth, 7.1), CAMERA, radius).read()
     assert not valid

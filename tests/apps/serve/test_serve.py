@@ -332,6 +332,15 @@ def test_features_come_as_lines_of_json(lockstep):
     assert frame["time"] == seen.time
     assert frame["feature"] == seen.feature.tolist()
     assert (frame["names"], frame["unit"], frame["valid"]) == (["x", "y", "z"], "m", [True] * 3)
+    assert "capture_time" not in frame
+
+
+def test_stamped_features_say_when_they_were_exposed():
+    stamped = {"kinematic": {"sensing": {"stamps": True}}}
+    with served(settings=stamped) as (server, address, _):
+        with connected(address, "features") as line, line.makefile("rb") as stream:
+            frame = json.loads(stream.readline())
+        assert frame["capture_time"] == server.rollout.observation.capture_time
 
 
 def test_a_port_that_cannot_be_opened_is_named_with_a_remedy(lockstep):
