@@ -34,6 +34,11 @@ PACKAGES = (
 OWN = {"controller": "own_controllers", "plant": "own_plants", "task": "own_tasks"}
 
 
+def _seeds_word(seeds: range) -> str:
+    """Return seeds as the option --seeds takes them."""
+    return f"{seeds.start}:{seeds.stop}" if len(seeds) > 1 else f"{seeds.start}"
+
+
 def describe_batch(
     runs: Survey,
     sections: Mapping[str, Any],
@@ -56,28 +61,29 @@ def describe_batch(
     configuration = {name: flatten(config) for name, config in sections.items()}
     commit, unknown = read_checkout()
     identity = json.dumps([runs.digest, configuration, steps], sort_keys=True, default=str)
+    given: dict[str, dict[str, Any]] = {key: {} for key in OWN.values()}
+    for offer in own:
+        given[OWN[offer.word]][offer.name] = offer.record()
+    engines = {}
+    for name in runs.plants:
+        plant = find_plant(name)
+        if plant.engine:
+            engines[name] = plant.engine()
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
-        **{
-            key: {each.name: each.record() for each in own if each.word == word}
-            for word, key in OWN.items()
-        },
+        **given,
         "plugins": dict(plugins(runs)),
         "files": named_files(runs, configuration, own),
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "robots": [describe_robot(name) for name in runs.robots],
         "sensings": [describe_sensing(word) for word in runs.sensings],
-        "seeds": ",".join(
-            f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds
-        ),
+        "seeds": ",".join(map(_seeds_word, runs.seeds)),
         "configuration": configuration,
         "changed": flatten(changed),
-        "engines": {
-            name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine
-        },
+        "engines": engines,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "blas": blas_libraries(),
         "python": platform.python_version(),
