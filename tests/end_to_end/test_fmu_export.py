@@ -4,6 +4,7 @@ import importlib.util
 import shutil
 import struct
 import tempfile
+import xml.etree.ElementTree as ET
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from kit.command import carried_out, python
+from kit.foreign_fmu import build_crane, describe_with
 from kit.plants import mismatched, setup
 from servobench.fmus import compiler as compiling
 from servobench.fmus import export
@@ -236,6 +238,24 @@ def test_information_tells_version_platform_and_variables(version):
         all(variable.unit and variable.description for variable in described.modelVariables)
         or version == 2
     )
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_license_is_in_the_description_and_shown(version, output_of):
+    with zipfile.ZipFile(cached_fmu(version)) as archive:
+        root = ET.fromstring(archive.read("modelDescription.xml"))
+    assert root.attrib["license"] == "BSD-3-Clause"
+    assert "\nlicense: BSD-3-Clause\n" in output_of("fmu", "info", cached_fmu(version))
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_license_of_a_foreign_fmu_is_shown_if_it_has_one(version, output_of, tmp_path):
+    name = 'modelName="Crane"'
+    licensed = describe_with(version, name, f'{name} license="[MIT] of its maker"')
+    one = build_crane(tmp_path / "licensed.fmu", version, description=licensed)
+    none = build_crane(tmp_path / "crane.fmu", version)
+    assert "\nlicense: [MIT] of its maker\n" in output_of("fmu", "info", one)
+    assert "license" not in output_of("fmu", "info", none)
 
 
 def problems_of(target: Path, name: str, old: bytes, new: bytes) -> tuple[str, ...]:

@@ -180,7 +180,7 @@ def validate(file: FileArgument) -> None:
 
 @fmu.command()
 def info(file: FileArgument) -> None:
-    """Show version, platforms, capabilities and variables."""
+    """Show version, license, platforms, capabilities and variables."""
     from servobench.fmus.inspection import read_information, shape_of
 
     with configuration_errors():
@@ -189,6 +189,8 @@ def info(file: FileArgument) -> None:
     say(f"{described.modelName}: FMI {described.fmiVersion}, {', '.join(information.interfaces)}")
     token = described.guid or described.instantiationToken
     say(f"made by {described.generationTool or 'unknown'}; token {token}")
+    if described.license:
+        say(f"license: {described.license}")
     sources = "; with sources" if information.has_sources else ""
     say(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
     for name, capabilities in information.interfaces.items():
