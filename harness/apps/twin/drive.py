@@ -27,7 +27,8 @@ MIN_CORRELATION: Final = 0.7  # [1] correlation of a joint with a command that i
 # A joint follows another one's command if its correlation with its own is below this share of that.
 MAX_OWN_SHARE: Final = 0.6  # [1]
 MIN_MOTION: Final = 0.05  # [rad] range of a joint that moves
-MAX_SPEED_RATIO: Final = 20.0  # [1] commands over joint speeds, in one unit
+# [1] Commands over joint speeds; in deg/s they are 57 times as large.
+MAX_SPEED_RATIO: Final = 20.0
 POSITION_TOLERANCE: Final = (
     0.1  # [rad] Commands that are joint positions are no farther from these.
 )

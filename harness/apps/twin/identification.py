@@ -110,7 +110,8 @@ class Log(NamedTuple):
     joints: FloatArray  # (k, n) [rad]
     features: FloatArray  # (k, m) [unit of the feature]
     valid: BoolArray  # (k,) whether a row has a new frame
-    commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
+    # (k, n) [rad/s], each from its row to the next; velocities of the joints are those of a spline
+    commands: FloatArray | None
     frame_time: FloatArray  # (k,) [s] when the frame of a row came, or by its stamp would have come at the mean latency
 
     @property

@@ -84,6 +84,7 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
             robot = other
     found = _clocks(log, robot)
     if not is_explained(log, robot):
+        # A mistake whose remedy explains the log comes before clocks, which may only seem to drift.
         known = robot.values_by_name() if _is_noise(log, robot) else {}
         found = _named_remedies(log, model, others, known) or found
         if not found:
