@@ -67,7 +67,7 @@ class Frames(NamedTuple):
     """The frames that are fitted, the oldest first."""
 
     time: FloatArray  # (..., F) [s] since the start
-    feature: FloatArray  # (..., F, m)
+    feature: FloatArray  # (..., F, m), in natural units
     weight: FloatArray  # (..., F, m), 1 for a valid feature, 0 for none
     path: FloatArray  # (..., F, J, n) [rad], joint positions up to the frame, `GRID` apart, the newest last
     number: IntArray  # (...), how many there are
@@ -87,7 +87,7 @@ class Members(NamedTuple):
 class Fitted(NamedTuple):
     """Residuals of members with their derivatives; frames are the last axis, along which most work is done."""
 
-    residual: FloatArray  # y − h, (..., E, m, F)
+    residual: FloatArray  # y − h, (..., E, m, F), in natural units
     rates: FloatArray  # ∂h by θ, L and ω, (..., E, P + 2, m, F)
     motion: FloatArray  # ẏ, (..., E, m, F), 1/s
 
@@ -218,7 +218,7 @@ class Fit:
     """The fits of the members to the frames of a buffer."""
 
     def __init__(self, model: FeatureModel, scale: float, period: float) -> None:
-        """Take the model, its unit in those of the frames' features, and the control period [s]."""
+        """Take the model, the factor from the frames' features to those of the model, and the control period [s]."""
         self.model = model
         self.scale = scale
         self.stride = max(1, round(GRID / period))

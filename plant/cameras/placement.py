@@ -67,12 +67,12 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
     size = mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
-        """Return numbers of ±1, (count, ...), the first ones alike for any count."""
+        """Return numbers from −1 to 1, (count, ...), the first ones alike for any count."""
         return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, (count, *shape))
 
-    mount = named_generator(seed, "mismatch.mount_axis").standard_normal((count, 3))
-    length = np.linalg.norm(mount, axis=-1, keepdims=True)
-    mount *= size(ON_HAND) * draw(ON_HAND, 1) / length
+    axis = named_generator(seed, "mismatch.mount_axis").standard_normal((count, 3))
+    length = np.linalg.norm(axis, axis=-1, keepdims=True)
+    mount = axis * (size(ON_HAND) * draw(ON_HAND, 1) / length)
     further_turns = [_draw_turn(mismatch, camera, seed) for camera in range(1, count)]
     return CameraDraws(
         focal=1.0 + size("focal") * draw("focal"),

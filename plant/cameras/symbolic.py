@@ -184,17 +184,17 @@ def symbolic_rotation(rpy: SX) -> SX:
     """Return Rz(yaw) Ry(pitch) Rx(roll), (3, 3), as `servobench.plant.robot.arm.rotation_from_rpy`."""
     c: SX = casadi.cos(rpy)
     s: SX = casadi.sin(rpy)
-    roll = _matrix(
+    turn_x = _matrix(
         (1, 0, 0),
         (0, c[0], -s[0]),
         (0, s[0], c[0]),
     )
-    pitch = _matrix(
+    turn_y = _matrix(
         (c[1], 0, s[1]),
         (0, 1, 0),
         (-s[1], 0, c[1]),
     )
-    return _turn_z(rpy[2]) @ pitch @ roll
+    return _turn_z(rpy[2]) @ turn_y @ turn_x
 
 
 def _turn_z(angle: SX) -> SX:

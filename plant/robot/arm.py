@@ -159,7 +159,7 @@ class SerialArm:
         return ball, np.swapaxes(motions, -1, -2)
 
     def motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
-        """Return g_i z_i × (p − o_i), (..., p, n, 3) m/rad, for points (..., p, 3) m of the base frame and `frames`."""
+        """Return g_i z_i × (p − p_i), (..., p, n, 3) m/rad, for points (..., p, 3) m of the base frame and `frames`."""
         axis = frames[..., None, : self.n, :3, 2]
         lever = points[..., None, :] - frames[..., None, : self.n, :3, 3]
         # numpy.cross would cost as much as the forward kinematics.

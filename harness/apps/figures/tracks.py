@@ -303,9 +303,9 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
 def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> Ensemble:
     """Return the ensemble of tracks and of runs that never began; a camera moves after that share of a run."""
     runs = pd.DataFrame([track.row for track in tracks])
-    longest = max(tracks, key=lambda track: len(track.table))
+    longest_track = max(tracks, key=lambda track: len(track.table))
     # All runs of an ensemble are thinned alike, so that they have common instants.
-    step = len(longest.table) // OVERVIEW if longest.long else 1
+    step = len(longest_track.table) // OVERVIEW if longest_track.long else 1
     few = [track.thinned(step) for track in tracks]
     time = max((track.time for track in few), key=len)
 
@@ -329,7 +329,7 @@ def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> En
         step_time=step_times[step_times > 0.0],
         settling_time=float(np.median(settled_after)),
         mostly_ended=bool(ended_early / (len(runs) + never) >= BAND[1]),
-        camera_moved_at=_camera_moved_at(runs, longest, camera_moves_at),
+        camera_moved_at=_camera_moved_at(runs, longest_track, camera_moves_at),
     )
 
 

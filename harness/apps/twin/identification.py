@@ -6,10 +6,10 @@ arrives at t_k, exposed a latency L before, and the joint motion under commands 
     y_k = h(q(t_k − L); θ) + ν_k,   ν ~ N(0, Σ)          τ v̇ = u(t − d) − v,   q(t_{k+1}) − q(t_k) = ∫ v dt
 
 with q a cubic spline through the logged positions. Where frames are stamped, t_k is when they would have come at the
-mean latency L. θ minimises Σ ρ(‖Σ^{-1/2} ν_k‖²) + Σ (θ_i/s_i)², with a soft L1 loss
-ρ while Σ and the outliers are found, and none at last for the frames that are left. s_i are wide priors (`PRIORS`), so
-that directions of θ that no frame tells (the zero of the first joint turns the arm as a turn of the camera does) stay
-at the nominal robot. The posterior is N(θ, c (JᵀΣ⁻¹J/f + S⁻²)⁻¹), where f is the correlation time of the residuals.
+mean latency L. θ minimises Σ ρ(‖Σ^{-1/2} ν_k‖²) + Σ (θ_i/s_i)², with a soft L1 loss ρ while Σ and the outliers are
+found, and none at last for the frames that are left. s_i are wide priors (`PRIORS`), so that directions of θ that no
+frame tells (the zero of the first joint turns the arm as a turn of the camera does) stay at the nominal robot. The
+posterior is N(θ, (JᵀΣ⁻¹J/f + S⁻²)⁻¹), with J = ∂h/∂θ and S = diag(s), where f is the correlation time of the residuals.
 """
 
 import sys
@@ -787,7 +787,7 @@ def _check_sensing(model: RobotModel) -> None:
 
 
 def _posterior(problem: _Problem, z: FloatArray, jacobian: FloatArray) -> Identified:
-    """Return the robot at z with its uncertainty, given the Jacobian of the residuals, (k m, p).
+    """Return the robot at z with its uncertainty, given the Jacobian of the whitened residuals by z, (k m, p).
 
     In z the prior is N(0, I): its information is I, and I/4 with twice the width.
     """
