@@ -207,6 +207,10 @@ class Servo:
                 ahead = ahead.with_values(ahead.joint_position, seen.feature)
                 J = seen.jacobian
                 drift = seen.drift
+                if not self._feeds_forward:
+                    # A law with a preview of its own sees the reference move against the drift.
+                    ahead_of_now = np.arange(self._rows)[:, None]
+                    later = later - ahead_of_now * drift[..., None, :]
         law, wanted = self._command(state, estimation, J, ahead, later)
         if not is_finite(wanted):
             raise ControllerDiverged(
