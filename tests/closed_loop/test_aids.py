@@ -33,9 +33,7 @@ def rows(controller, task, mismatch, seeds, *settings, latency=None):
 
 
 @pytest.mark.parametrize("name", some([*EQUIPPED, PAPER], PLUS, "ukf_mpc", PAPER))
-def test_with_its_aids_a_method_settles_soon_behind_a_turned_and_late_camera_and_the_published_one_never(
-    name,
-):
+def test_behind_a_turned_and_late_camera_a_method_settles_soon_only_with_its_aids(name):
     times = [
         each["settling_time_s"] for each in rows(name, "random", TURNED, range(2), latency=0.1)
     ]
@@ -65,9 +63,7 @@ def test_it_is_sooner_there_with_less_overshoot_than_the_method_of_the_paper():
 
 
 @pytest.mark.parametrize("name", some(IDENTIFYING, PLUS))
-def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_that_answers_at_once(
-    name,
-):
+def test_the_noise_of_frames_hides_no_camera_delay_from_an_arm_that_answers_at_once(name):
     """A law turns the noise of a frame into motion, which at a delay of 0 would explain that this noise is gone."""
     found = rows(name, "circle", "moderate", range(2), "kinematic.command_delay=0", latency=0.05)
     assert max(each["rms_error_evaluated"] for each in found) < 0.003

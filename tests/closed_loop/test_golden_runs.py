@@ -46,9 +46,7 @@ def made(tmp_path_factory):
     platform.machine() != "x86_64", reason="the table is of a kernel of OpenBLAS for x86-64"
 )
 @pytest.mark.parametrize("plant", plant_parameters(golden.DURATIONS))
-def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(
-    plant, made
-):
+def test_the_first_periods_and_settling_time_of_every_method_are_those_of_the_table(plant, made):
     if plant == "mujoco" and golden.RENDERER not in engine_of(plant):
         pytest.skip(
             f"the images of the table are of {golden.RENDERER}, and those here of {engine_of(plant)}"

@@ -54,9 +54,7 @@ def build(aids=EQUIPPED):
 
 
 @pytest.mark.parametrize(("task", "sensing"), [("random", "position"), ("circle", "pixel:hand")])
-def test_a_law_written_as_a_controller_moves_the_arm_as_the_same_law_among_the_parts_does(
-    task, sensing
-):
+def test_a_law_written_as_a_controller_moves_the_arm_as_the_same_law_as_a_part_does(task, sensing):
     aids = {"aids": dict(EQUIPPED), "law": {"proportional_gain": GAIN, "damping": DAMPING}}
     where = {"task": task, "sensing": sensing, "seed": 3}
     short = {
@@ -69,7 +67,7 @@ def test_a_law_written_as_a_controller_moves_the_arm_as_the_same_law_among_the_p
     np.testing.assert_allclose(own.steps[columns], part.steps[columns], atol=1e-8)
 
 
-def test_it_gets_the_seed_and_with_the_feedforward_of_the_chain_one_row_of_the_reference_otherwise_all():
+def test_it_gets_the_seed_and_one_row_of_the_reference_if_the_chain_feeds_forward():
     for aids, preview in ((EQUIPPED, 0), ({**EQUIPPED, "feedforward": False}, 10)):
         own, driver = build(aids)
         driver.seed = 7

@@ -103,7 +103,7 @@ def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_bega
     np.testing.assert_allclose(begun.learned.pair.base, 0.3 * np.array([[2.0, 1.0]]))
 
 
-def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_frames():
+def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_frames():
     q = path(0.6)
     recorder = Recorder()
     y = late_features(q, np.eye(M)) + 0.01 * np.random.default_rng(3).normal(size=(len(q), M))

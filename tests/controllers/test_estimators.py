@@ -160,7 +160,7 @@ def test_the_split_forms_equal_the_full_ones(n, m):
         assert run.diagnostics() == pytest.approx(runs[0].diagnostics())
 
 
-def test_joseph_form_keeps_the_covariance_positive_definite_under_nearly_exact_measurements():
+def test_a_covariance_in_joseph_form_stays_positive_definite_under_tiny_noise():
     P = np.eye(6) * 1e4
     J = np.zeros((3, 6))
     rng = np.random.default_rng(8)

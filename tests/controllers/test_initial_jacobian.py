@@ -84,7 +84,7 @@ def test_frames_slower_than_the_control_prolong_a_rest_until_there_are_three():
     )
 
 
-def test_the_matrix_of_a_model_is_stored_by_rows_whatever_the_layout_that_the_model_returns():
+def test_the_matrix_of_a_model_is_stored_by_rows_whatever_layout_the_model_returns():
     """Products of another layout have other bits, and in some lanes only a copy would change the layout."""
     J = np.asfortranarray(np.arange(8.0).reshape(2, 4))
     knowledge = RobotKnowledge(plant_spec(4, 2), 0, nominal_jacobian=lambda q: J)
@@ -148,9 +148,7 @@ def test_a_nominal_model_of_another_robot_is_refused():
     ("config", "jacobian"),
     [(InitialConfig(), [[0.2, 0.6]]), (InitialConfig("given", given=((1.0, 2.0),)), [[1.0, 2.0]])],
 )
-def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_taken_as_it_is(
-    config, jacobian
-):
+def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_kept(config, jacobian):
     provider = initial_jacobian(
         config, RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :])
     )

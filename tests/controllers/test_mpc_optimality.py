@@ -108,7 +108,7 @@ def random_lanes(rng, scale):
 @pytest.mark.parametrize(
     ("scale", "period"), [(1e-3, 0.05), (0.05, 0.05), (1.0, 0.05), (1.0, 0.02), (0.05, 0.0125)]
 )
-def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_documented(
+def test_every_plan_satisfies_the_optimality_conditions_of_the_documented_problem(
     mode, limits, scale, period
 ):
     spec = replace(

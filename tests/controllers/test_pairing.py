@@ -251,7 +251,7 @@ def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(p
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1
 
 
-def test_a_jump_of_the_feature_is_no_motion_and_after_three_frames_any_map_is_possible_again():
+def test_a_jump_is_no_motion_and_after_three_frames_any_map_is_possible_again():
     q = path(1.6)
     made = Following()
     y = late_features(q, np.eye(M), 0)
@@ -289,9 +289,7 @@ def test_the_delay_is_found_where_the_jacobian_is_only_the_nominal_one():
     np.testing.assert_array_equal(made.state.jacobian, NETWORK.jacobian(q[-1]))
 
 
-def test_a_model_that_is_wrong_by_more_than_a_map_hides_neither_the_delay_nor_the_noise(
-    monkeypatch,
-):
+def test_a_model_wrong_by_more_than_a_map_hides_neither_the_delay_nor_the_noise(monkeypatch):
     """Two columns of the Jacobian differ: without E what a map leaves passes for noise."""
     rows = NETWORK.weights.copy()
     rows[-2:] *= -0.5
@@ -360,7 +358,7 @@ def jittering(count, seed=2):
     return parts
 
 
-def test_with_stamps_the_joints_at_the_exposure_are_found_however_the_latency_jitters(monkeypatch):
+def test_with_stamps_the_joints_at_exposure_are_found_however_the_latency_jitters(monkeypatch):
     """Those between two periods are those of a parabola, exactly."""
     monkeypatch.setattr(pairing, "DRIFT_STEP", 0.0)
     parts = jittering(40)

@@ -32,7 +32,7 @@ def test_periods_that_are_whole_but_for_rounding_are_whole():
     assert in_periods(0.0, 0.02) == 0.0
 
 
-def test_the_rounding_of_many_periods_is_a_share_of_them_and_that_of_one_a_share_of_one():
+def test_the_rounding_of_many_periods_is_a_share_of_them_and_of_one_a_share_of_one():
     assert in_periods(0.05 * (1e4 + 1e-6), 0.05) == 1e4
     assert in_periods(0.05 * (1.0 + 1.5e-9), 0.05) != 1.0
 

@@ -37,7 +37,7 @@ def test_the_first_step_equals_the_one_computed_by_hand():
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
 
-def test_the_derivative_is_the_filtered_difference_of_the_error_and_the_first_error_has_none():
+def test_the_derivative_is_the_filtered_difference_of_errors_and_the_first_has_none():
     law = fresh(proportional_gain=1.0, derivative_gain=1.0, derivative_filter=0.15)
     # d = 0, then (0.15 · 0 + 0.3 − 0.1) / (0.15 + 0.05) = 1, then (0.15 · 1 + 0.4 − 0.3) / (0.15 + 0.05) = 1.25
     for error, d in ((0.1, 0.0), (0.3, 1.0), (0.4, 1.25)):

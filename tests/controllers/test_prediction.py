@@ -189,7 +189,7 @@ def test_without_a_frame_the_feature_follows_the_joints_from_the_last_one(missin
     np.testing.assert_allclose(ahead, at(NOW))
 
 
-def test_a_feature_that_is_not_seen_follows_the_joints_while_the_others_are_corrected():
+def test_a_feature_that_is_not_seen_follows_the_joints_while_others_are_corrected():
     _, z = predicted(
         MOVING, seen(NOW, [0.8, 0.9], valid=np.array([True, False])), at(EXPOSED - BEFORE)
     )

@@ -94,7 +94,7 @@ def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit
     np.testing.assert_allclose(ahead.wanted, wanted[0], atol=1e-12)
 
 
-def test_the_direction_is_that_of_automatic_differentiation_of_each_term_through_its_own_step():
+def test_the_direction_is_the_automatic_derivative_of_each_term_through_its_own_step():
     net = network(error_history=2)
     J, (errors, _), steps, ahead = case(net)
     n, p, hidden = net.weights.shape
@@ -150,9 +150,7 @@ def test_the_first_step_equals_the_one_computed_by_hand():
 
 
 @pytest.mark.parametrize("far", [1.0, 30.0])
-def test_without_an_error_the_offset_free_law_rests_also_far_from_where_its_network_was_trained(
-    far,
-):
+def test_without_an_error_the_offset_free_law_rests_also_far_from_its_training(far):
     q = np.full(3, far)
     y = np.array([0.3, -0.2])
     observation = seen(q, y)

@@ -112,7 +112,7 @@ def test_one_update_by_hand_and_every_filter_on_its_own():
     np.testing.assert_allclose(bank[1], [[1.0, 3.0], [4.0, 0.0], [0.0, 0.6]])
 
 
-def test_motions_that_do_not_count_are_considered_and_teach_nothing_but_the_noise_of_their_frame():
+def test_motions_that_do_not_count_teach_nothing_but_the_noise_of_their_frame():
     x, dy, model = motions(6, 2)
     bank, _ = filtered(x, dy, model)
     new, found = learned(bank, x[0], dy[0], model[0], learns=False)
@@ -246,7 +246,7 @@ def test_a_short_motion_changes_the_noise_of_the_frame_and_nothing_else():
     assert (run.state.mean[:, -1] > before.mean[:, -1]).all()
 
 
-def test_maps_near_rotations_are_completed_and_all_else_moves_along_as_jointly_gaussian():
+def test_maps_near_rotations_are_completed_and_all_else_moves_as_jointly_gaussian():
     """Given that M + N(0, ς²) is R, W has its conditional mean; R solves Wahba's problem by the axes of the weight."""
     run = Walking(sigma=3e-3).follow(6, lambda q: TURN @ NOMINAL @ q, NOMINAL)
     weights = softmax(-0.5 * run.state.scores)
@@ -293,7 +293,7 @@ def test_outliers_go_into_the_noise_of_their_frames_and_leave_the_model_alone(fr
     assert run.state.moves == without.state.moves == 0
 
 
-def test_three_frames_that_fit_only_one_another_are_a_moved_camera_and_three_outliers_are_not():
+def test_a_moved_camera_is_three_frames_that_fit_only_one_another_not_three_outliers():
     jump = np.full((20, M), 0.3)
     apart = 0.3 * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
     moved = jumping(jump, 43)

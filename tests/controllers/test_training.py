@@ -267,7 +267,7 @@ def test_corrupt_and_foreign_files_are_refused_in_one_line(tmp_path, networks):
         load_networks(path)
 
 
-def test_files_of_another_version_robot_or_configuration_and_missing_ones_are_refused(
+def test_missing_files_and_those_of_other_versions_robots_or_settings_are_refused(
     tmp_path, networks
 ):
     path = tmp_path / "networks.npz"

@@ -67,7 +67,7 @@ def cluster(tmp_path):
             process.wait()
 
 
-def test_a_cluster_runs_what_is_in_files_and_a_worker_that_is_killed_in_mid_sweep_loses_no_run(
+def test_a_cluster_runs_what_is_in_files_and_a_worker_killed_in_a_sweep_loses_no_run(
     cluster, tmp_path, monkeypatch
 ):
     scheduler, workers = cluster

@@ -44,7 +44,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(output_of, tmp_path):
 
 
 @pytest.mark.parametrize("plant", ["kinematic", pytest.param("bullet", marks=NEEDS_BULLET)])
-def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(
+def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_and_in_two_workers(
     output_of, tmp_path, plant
 ):
     tables = []

@@ -304,9 +304,7 @@ def test_words_of_the_field_are_linked_to_the_glossary_where_they_first_appear(n
         )
 
 
-def test_pages_install_from_the_clone_until_a_release_is_published_and_one_word_switches_them(
-    monkeypatch,
-):
+def test_pages_install_from_the_clone_until_one_word_says_that_a_release_is_out(monkeypatch):
     pages = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
     assert [
         name for name, text in pages.items() if re.search(r"pip install '?servobench", text)

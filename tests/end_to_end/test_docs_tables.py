@@ -71,7 +71,7 @@ def test_a_section_with_a_table_of_its_own_is_not_printed_again():
     assert "sensing.noise_share" not in shown
 
 
-def test_a_setting_that_several_classes_share_stands_once_and_names_those_that_have_it():
+def test_a_setting_that_several_classes_share_stands_once_and_names_those_with_it():
     laws = {name: LAWS[name].config for name in ("mfac", "pid")}
     shown = generated_tables.settings_table(
         {"one": laws["mfac"], "two": laws["mfac"], "three": laws["pid"]}

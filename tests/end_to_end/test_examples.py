@@ -57,9 +57,7 @@ def test_a_law_of_ones_own_keeps_the_contract_of_controllers(law):
 
 
 @pytest.mark.parametrize("law", some(LAWS, "damped_inverse"))
-def test_a_law_of_ones_own_keeps_up_with_a_method_of_the_bench_with_the_aids_and_only_with_them(
-    law,
-):
+def test_a_law_of_ones_own_keeps_up_with_a_method_of_the_bench_only_with_the_aids(law):
     place = f"{FOLDER / law}.py:{LAWS[law]}"
     names = [LAWS[law], f"{LAWS[law]}Alone", "ukf_mfac"]
     short = {"random": {"duration": 3.0}, "circle": {"lap_time": 4.0, "radius": 0.15}}

@@ -116,7 +116,7 @@ def test_without_an_engine_no_film_is_made_and_a_line_says_what_to_install(tmp_p
     assert done.stderr.count("\n") == 1
 
 
-def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and_says_why(tmp_path):
+def test_without_an_engine_a_run_that_names_no_plant_is_kinematic_and_says_why(tmp_path):
     done = servobench_without(
         ("pybullet", "mujoco"), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path
     )

@@ -143,7 +143,7 @@ def test_what_a_page_shows_is_what_comes_out(reader, monkeypatch, capsys, page):
     assert count > 0 or page in HOUR
 
 
-def test_the_first_hour_begins_the_site_its_pages_leave_folders_of_their_own_and_no_exception_is_out_of_date():
+def test_the_first_hour_begins_the_site_and_each_of_its_pages_leaves_its_own_folders():
     assert SITE[: len(HOUR)] == list(HOUR)
     texts = [read(f"{page}.md") for page in HOUR]
     made = [set(re.findall(r"--out (\w+)", text)) for text in texts]

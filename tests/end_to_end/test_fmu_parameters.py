@@ -184,7 +184,7 @@ def test_the_debug_log_of_an_fmu_is_on_where_a_file_is_named_and_it_gets_a_toler
     ]  # fmt: skip
 
 
-def test_a_debug_log_stands_beside_the_mapping_and_one_that_cannot_be_written_is_refused(tmp_path):
+def test_a_debug_log_stands_beside_the_mapping_and_an_unwritable_one_is_refused(tmp_path):
     build_crane(tmp_path / "crane.fmu", 3)
     file = tmp_path / "crane.toml"
     file.write_text(

@@ -118,7 +118,7 @@ def test_a_single_run_ends_with_its_row(output_of, tmp_path):
     assert results.load_runs(out)["status"].tolist() == ["crashed"]
 
 
-def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_that_hangs(
+def test_nothing_outlives_a_killed_batch_and_resumed_it_goes_past_a_run_that_hangs(
     tmp_path, monkeypatch
 ):
     out, mark = tmp_path / "out", "resumed"

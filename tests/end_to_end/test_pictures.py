@@ -61,7 +61,7 @@ def legend_of(figure) -> list[str]:
     return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
-def test_every_method_has_a_line_and_a_marker_of_its_own_so_that_colour_is_not_needed():
+def test_every_method_has_a_line_and_marker_of_its_own_so_that_colour_is_not_needed():
     styles = method_styles([*KNOWN, *OTHERS])
     looks = {(str(style.line), style.marker) for style in styles.values()}
     assert len(looks) == len(KNOWN) + len(OTHERS)
@@ -93,9 +93,7 @@ def test_the_page_of_results_names_every_kind_of_figure_in_its_order():
     assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(KINDS)
 
 
-def test_a_comparison_gives_the_figures_of_the_paper_and_more_with_a_unit_at_every_axis_and_every_controller(
-    tmp_path,
-):
+def test_the_figures_of_a_comparison_have_a_unit_at_every_axis_and_every_controller(tmp_path):
     figures = list(folder_figures(ResultsFolder(comparison(tmp_path / "out"))))
     assert [named.kind for named in figures] == [
         "errors", "features", "paths", "tracking", "tracking_path", "jacobian", "settling", "effort", "smoothness",
@@ -200,9 +198,7 @@ def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
         assert min(width, height) > 100
 
 
-def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_one_is_told(
-    tmp_path,
-):
+def test_without_a_true_jacobian_its_error_has_no_figure_and_an_exact_one_is_told(tmp_path):
     unknown = made_up_steps("a")
     unknown["jacobian_error"] = np.nan
     assert "jacobian" not in kinds(
@@ -274,7 +270,7 @@ def test_half_an_hour_is_drawn_with_few_points(tmp_path):
     )
 
 
-def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last_rows():
+def test_an_overview_keeps_the_root_mean_square_error_and_a_closing_the_last_rows():
     steps = made_up_steps("a", curve=True, periods=12_000).assign(
         error_norm=np.tile([3.0, 4.0], 6000)
     )
@@ -311,9 +307,7 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     assert line.get_xdata().tolist() == [0.0, 50.0]
 
 
-def test_noise_that_is_crossed_with_an_axis_has_a_panel_and_noise_that_is_the_axis_none_of_its_own(
-    tmp_path,
-):
+def test_noise_has_a_panel_of_its_own_only_where_it_is_crossed_with_another_axis(tmp_path):
     runs = results.load_runs(sweep(tmp_path / "out"))
     moves = split_tasks(runs)[0].assign(axis="links", magnitude=5.0, unit="%", latency_s=np.nan)
     turned = moves.assign(axis="tool", magnitude=9.0)

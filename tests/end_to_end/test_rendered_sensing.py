@@ -63,9 +63,7 @@ def test_with_noise_the_centre_has_no_bias_of_note(open_scene, model):
         assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
 
 
-def test_stereo_noise_without_patches_moves_the_centre_by_less_than_the_noise_of_kinematic(
-    open_scene,
-):
+def test_stereo_noise_without_patches_moves_the_centre_less_than_that_of_kinematic(open_scene):
     white, _ = errors_over_poses(open_scene, RenderedConfig(depth_patch=0.0), 50)
     assert (white.std(axis=0) < 0.001).all()
 

@@ -48,9 +48,7 @@ def open_setup(engine):
 
 
 @pytest.mark.parametrize("word", IN_PIXELS)
-def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(
-    word, engine
-):
+def test_what_is_found_is_where_the_closed_form_has_it_and_discs_are_not_confused(word, engine):
     model, rng = true_model(word), np.random.default_rng(5)
     scene = load_engine(engine).scene(Room(model.arm, scenery=False, robot=UR5, model=model))
     detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0

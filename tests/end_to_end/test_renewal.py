@@ -176,7 +176,7 @@ def test_all_tables_of_pages_belong_to_a_study_and_all_stored_ones_are_on_a_page
     assert [name for name in shown if f'"{name}"' not in source] == []
 
 
-def test_no_study_judges_on_seeds_that_methods_were_tuned_on_and_names_are_those_of_the_folders():
+def test_no_study_judges_on_seeds_of_the_tuning_and_names_are_those_of_the_folders():
     for name, study in STUDIES.items():
         assert study.name == name
         for command in study.commands.values():

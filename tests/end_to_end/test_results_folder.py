@@ -95,7 +95,7 @@ def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refu
     assert examine(ResultsFolder(out)).findings == []
 
 
-def test_a_process_that_is_refused_waits_for_the_name_of_one_that_has_just_taken_the_lock(tmp_path):
+def test_a_refused_process_waits_for_the_name_of_one_that_has_just_taken_the_lock(tmp_path):
     file = tmp_path / lock.LOCK
     with file.open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
@@ -151,7 +151,7 @@ def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed
     ("--steps", "--runs", "4", "--every", "65"),
     ("--caches", "--every", "31"),
 ])  # fmt: skip
-def test_a_batch_and_caches_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(
+def test_a_batch_and_caches_broken_at_any_file_operation_can_be_resumed_bit_for_bit(
     tmp_path, arguments
 ):
     figures = file_faults.start(tmp_path, *arguments, timeout=550)

@@ -151,7 +151,7 @@ def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(
     assert_same_runs(out, undisturbed)
 
 
-def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single_runs(
+def test_a_sweep_over_control_periods_has_the_same_robots_and_rows_as_single_runs(
     output_of, monkeypatch, tmp_path
 ):
     out, alone = tmp_path / "periods", tmp_path / "alone"

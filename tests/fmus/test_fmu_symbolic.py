@@ -98,7 +98,7 @@ def test_casadi_reads_the_equations_of_the_ur5_back():
     np.testing.assert_allclose(np.asarray(squared(q[1])).ravel(), wanted, rtol=0, atol=1e-9)
 
 
-def test_on_the_ur5_the_predictive_bound_commands_the_same_by_the_fmu_as_by_the_equations():
+def test_on_the_ur5_the_predictive_bound_commands_the_same_by_fmu_as_by_equations():
     true = mismatched("severe")
     plant = ENTRY.build(Ur5FmuConfig(), PlantSetup(true, np.array(HOME), 0.05))
     model = plant.true_model()
@@ -131,7 +131,7 @@ def test_upper_bounds_run_on_a_foreign_fmu_through_its_mapping(tmp_path, control
     assert result.steps["error_norm"].iloc[0] > 0.1
 
 
-def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_are_named(tmp_path):
+def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_states_are_named(tmp_path):
     path = mapped(tmp_path, MAPPING + STATES)
     plant = crane(path)
     plant.reset(0)

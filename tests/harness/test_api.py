@@ -22,7 +22,7 @@ from servobench.plant.contract.settings import remark
 SHORT = {"exp1": {"duration": 0.5}}
 
 
-def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process_and_a_line_says_so(caplog):
+def test_a_line_says_that_a_controller_that_cannot_be_pickled_runs_in_this_process(caplog):
     class Local(Resting):
         """As Resting."""
 
@@ -55,9 +55,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("place", ["isolate=True", "executor=pool"])
-def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_refused_with_the_remedy(
-    tmp_path, place
-):
+def test_a_controller_below_the_guard_of_a_script_is_refused_with_the_remedy(tmp_path, place):
     (tmp_path / "script.py").write_text(BELOW_THE_GUARD.replace("isolate=True", place))
     remedy = "define it above `if __name__ == '__main__':`"
     line = python(
@@ -211,9 +209,7 @@ def test_every_public_name_has_a_docstring_and_no_other_name_is_there():
 
 
 @pytest.mark.slow
-def test_importing_the_package_imports_nothing_heavy_and_folders_of_the_same_names_do_no_harm(
-    tmp_path,
-):
+def test_the_package_imports_nothing_heavy_and_folders_of_the_same_names_do_no_harm(tmp_path):
     for name in ("plant", "controllers", "harness", "fmus"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('a foreign package')")

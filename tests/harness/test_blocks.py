@@ -131,7 +131,7 @@ def test_an_executor_that_says_how_many_workers_it_has_gets_work_for_all():
         assert workers.count == 3
 
 
-def test_an_executor_that_has_no_workers_yet_or_does_not_say_how_many_gets_work_for_those_that_are_given():
+def test_an_executor_that_has_or_tells_no_workers_gets_work_for_the_number_given():
     silent = Here()
     silent._max_workers = None
     distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
@@ -284,9 +284,7 @@ def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_a
 
 
 @pytest.mark.parametrize("answers", [0, 1, 3])
-def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer_are_carried_out_again(
-    answers,
-):
+def test_unanswered_runs_of_a_process_ended_once_from_outside_are_carried_out_again(answers):
     sizes: list[int] = []
 
     def submit(task):

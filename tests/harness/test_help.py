@@ -25,7 +25,7 @@ def _a_terminal_of_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
 
 
-def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_columns(output_of):
+def test_commands_come_in_the_order_of_first_use_each_on_one_line_of_80_columns(output_of):
     text = output_of()
     listed = [
         line[2:13].strip()

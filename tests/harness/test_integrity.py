@@ -348,9 +348,7 @@ def test_a_batch_whose_checksums_are_lost_in_their_file_is_carried_out_again(bas
     assert_same(folder, whole)
 
 
-def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(
-    begun, whole
-):
+def test_a_manifest_lost_together_with_a_part_is_written_anew_from_the_other_parts(begun, whole):
     (begun / results.MANIFEST).unlink()
     flip(begun / results.part_name(8, results.RUNS))
     assert run(begun, resume=True).repeated == 16
@@ -456,9 +454,7 @@ def test_rows_that_the_part_before_has_too_are_named_where_nothing_vouches_for_t
     )
 
 
-def test_a_changed_bit_is_found_by_the_pages_where_nothing_else_vouches_also_in_some_of_the_runs(
-    tmp_path,
-):
+def test_a_changed_bit_is_found_by_the_pages_where_nothing_else_vouches_for_a_file(tmp_path):
     folder = tmp_path / "out"
     run(folder, seeds=range(2), steps=True)
     (folder / SUMS).unlink()

@@ -106,9 +106,7 @@ main()
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
-def test_a_command_that_is_terminated_leaves_no_temporary_file_and_nothing_that_looks_whole(
-    name, tmp_path
-):
+def test_a_terminated_command_leaves_no_temporary_file_and_nothing_that_looks_whole(name, tmp_path):
     folder = comparison(tmp_path / "folder", tuple(f"c{k}" for k in range(8)), ("exp1",))
     (tmp_path / "temporary").mkdir()
     ended = python(

@@ -36,9 +36,7 @@ def importing(text, name, folder, monkeypatch):
 
 
 @pytest.mark.slow
-def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(
-    tmp_path, monkeypatch
-):
+def test_no_worker_that_starts_too_late_is_left_for_this_process_to_wait_for(tmp_path, monkeypatch):
     monkeypatch.setattr(isolation, "GUARD_START", 0.5)
     before = set(multiprocessing.active_children())
     with importing(
@@ -172,7 +170,7 @@ while True:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("starts", "stopper"), [(False, ""), (True, ""), (False, STOPPER)])
-def test_what_is_stopped_once_or_for_ever_or_starts_ends_with_the_process_that_started_it(
+def test_what_is_stopped_or_only_starting_ends_with_the_process_that_started_it(
     starts, stopper, tmp_path
 ):
     (tmp_path / "killed.py").write_text(KILLED.format(starts=starts, stopper=stopper))
@@ -275,8 +273,6 @@ def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "wanted"), [("constant", ["numpy.ma"]), ("fmu:pilot.fmu", ["pandas", "numpy.ma"])]
 )
-def test_pandas_is_imported_once_and_beyond_the_limit_of_memory_where_code_of_others_runs(
-    name, wanted
-):
+def test_pandas_is_imported_once_and_beyond_the_memory_limit_where_foreign_code_runs(name, wanted):
     with open_workers(2, bounds=Bounds(run_memory=150e6), controllers=[name]) as workers:
         assert workers.submit(Task(say_modules, pickle.dumps(None))).result().items == [wanted]

@@ -122,7 +122,7 @@ def test_the_shell_completes_names_also_within_lists(words, wanted):
         (["servobench", "run", "a", ":", "b", ""], ["servobench", "run", "a:b", ""], ""),
     ],
 )
-def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_were_typed(
+def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_typed(
     words, joined, before
 ):
     assert join_words([*words, "after"], len(words) - 1) == (joined, before)

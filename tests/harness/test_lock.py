@@ -43,7 +43,7 @@ def other_process(folder):
         process.stdout.close()
 
 
-def test_the_second_process_learns_who_holds_the_folder_and_a_killed_one_holds_it_no_more(tmp_path):
+def test_another_process_learns_who_holds_a_folder_and_a_killed_one_holds_it_no_more(tmp_path):
     out = tmp_path / "out"
     with other_process(out) as process:
         with (
@@ -114,9 +114,7 @@ def test_a_process_with_the_number_of_one_that_ended_is_another_one():
     assert not holder(pid=2**22 + 1, host="elsewhere").gone
 
 
-def test_a_lock_left_by_another_machine_is_free_for_the_system_s_locks_reach_all_that_share_the_folder(
-    tmp_path,
-):
+def test_a_lock_left_by_another_machine_is_free_as_system_locks_reach_all_machines(tmp_path):
     (tmp_path / LOCK).write_text(json.dumps(asdict(holder(host="elsewhere", pid=7))))
     with locked(tmp_path) as lock:
         assert lock.stale.host == "elsewhere"

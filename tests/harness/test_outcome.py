@@ -95,9 +95,7 @@ def test_a_target_out_of_reach_counts_before_a_joint_at_its_stop(target, at_stop
     assert find_outcome(log.steps(), scenario, np.nan, 0.17, robot) == outcome
 
 
-def test_outcomes_of_runs_side_by_side_are_those_of_each_alone_however_few_fit_into_memory(
-    monkeypatch,
-):
+def test_runs_side_by_side_have_the_outcomes_of_each_alone_however_few_fit_in_memory(monkeypatch):
     settings = {"random": {"duration": 1.0}}
     runs = [run("ukf_mfac", "random", settings, seed, "severe") for seed in range(40001, 40008)]
     alone = [carry_out(each, steps=False).row["outcome"] for each in runs]

@@ -1,6 +1,7 @@
 """Code stays open enough to be read: one statement, one fact. Limits are no targets: what needs more may raise them."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,13 @@ def test_forms_that_hide_a_decision_or_a_second_fact_stay_rare():
     assert reading.conditional_expressions <= 550
     assert reading.nounless_comments <= 30
     assert reading.reasons >= 250
+
+
+def test_a_name_of_a_test_has_at_most_80_letters():
+    texts = [path.read_text(encoding="utf-8") for path in files("tests")]
+    names = [name for text in texts for name in re.findall(r"def (test_\w+)", text)]
+    assert names
+    assert [name for name in names if len(name) > 80] == []
 
 
 def densest(reading) -> list[str]:

@@ -427,7 +427,7 @@ def read_steps(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "read"), [(results.RUNS, read_runs), (results.STEPS, read_steps)])
-def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_one_line(
+def test_a_foreign_table_lacking_a_column_is_read_without_it_or_refused_in_one_line(
     tmp_path, kind, read
 ):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "rls"), tasks=("exp1", "circle"))

@@ -75,7 +75,7 @@ def test_laws_and_estimators_see_a_metre_whatever_the_unit():
         seen = plant.step(commands[0])
 
 
-def test_noise_of_pixels_is_the_same_from_everywhere_and_that_of_the_ball_in_the_planned_image():
+def test_noise_of_pixels_is_everywhere_that_of_the_ball_in_the_planned_image():
     robot, entry = find_robot("ur5"), find_plant("kinematic")
     for word in ("pixel", "pixel:hand", "plate"):
         model = find_sensing(word).nominal(robot)

@@ -177,7 +177,7 @@ def three_controllers():
     )
 
 
-def test_the_better_controller_has_a_negative_mean_difference_of_pairs_and_not_of_means():
+def test_the_better_controller_has_a_negative_mean_difference_of_pairs_not_of_means():
     runs = three_controllers()
     (found,) = compare_pairs(runs, [("a", "b")])
     paired = runs.pivot_table(index="seed", columns="controller", values="settling_time_s")
@@ -376,7 +376,7 @@ def test_runs_are_classed_by_how_they_ended():
     assert settling_times(runs).notna().tolist() == [True, False, False, False, True]
 
 
-def test_runs_that_all_ended_before_their_first_period_have_no_metrics_and_are_classed_all_the_same():
+def test_runs_that_all_ended_before_their_first_period_are_classed_without_metrics():
     runs = table(controller=["a", "b"], seed=[0, 0]).assign(status="crashed")
     assert outcomes(runs).tolist() == ["crashed", "crashed"]
     (found,) = compare_pairs(runs, [("a", "b")])

@@ -241,7 +241,7 @@ def test_a_controller_slower_than_the_period_is_marked_and_counted():
     assert "*" not in summary_legend(runs.tail(1))
 
 
-def test_the_judged_part_is_named_for_each_curve_and_that_of_a_user_s_task_is_its_own():
+def test_the_judged_part_is_named_for_each_curve_and_that_of_a_users_task_is_its_own():
     curves = pd.DataFrame(
         [
             made_up_row(task, task=task, task_kind="curve")

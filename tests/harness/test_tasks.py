@@ -51,7 +51,7 @@ def test_a_task_of_a_file_is_carried_out_with_its_settings_and_recorded(tmp_path
 
 
 @pytest.mark.slow
-def test_worker_processes_carry_out_the_same_runs_of_users_code_and_the_manifest_names_it(tmp_path):
+def test_workers_carry_out_the_same_runs_of_users_code_and_the_manifest_names_it(tmp_path):
     for name, text in {"a/cell.py": CELL, "b/mine.py": WHOLE, "c/spiral.py": SPIRAL}.items():
         write(tmp_path, text, name)
     asked = ["b/mine.py", Resting], ["a/cell.py", "kinematic"], ["c/spiral.py", "exp1"]

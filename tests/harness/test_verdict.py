@@ -62,7 +62,7 @@ def test_the_first_sentence_names_the_best_and_by_how_much():
     assert result == "`a` is best: 1.00 s ahead of `b` in settling time."
 
 
-def test_the_first_sentence_names_all_that_are_practically_equal_and_those_that_are_undecided():
+def test_the_first_sentence_names_all_that_are_practically_equal_or_undecided():
     verdict = judge(runs_of(8, a=1.0, b=2.0, c=1.01))
     assert (
         verdict.result

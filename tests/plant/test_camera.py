@@ -12,7 +12,7 @@ def points(count: int) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(0.4, 2.0, count)])
 
 
-def test_the_clipping_planes_are_those_of_the_bench_unless_a_target_is_nearer_or_farther():
+def test_clipping_planes_are_those_of_the_bench_unless_a_target_is_nearer_or_farther():
     # A UR5's cameras beside the arm and on its hand
     assert CAMERA.reaching(1.3) == CAMERA.reaching(0.5) == CAMERA
     assert (CAMERA.reaching(0.05).near, CAMERA.reaching(4.6).far) == pytest.approx((0.01, 8.05))

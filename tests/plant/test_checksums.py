@@ -49,7 +49,7 @@ def test_a_file_may_have_the_content_of_any_of_its_lines(tmp_path):
     assert (tmp_path / SUMS).read_text() == f"{DIGESTS[0]}  one\n{DIGESTS[1]}  one\n"
 
 
-def test_a_line_is_on_the_disk_before_its_file_has_its_name_and_the_file_before_its_line(
+def test_a_line_is_on_the_disk_after_its_file_and_before_that_file_has_its_name(
     tmp_path, monkeypatch
 ):
     events, written = [], []

@@ -64,7 +64,7 @@ def test_a_sphere_off_the_axis_has_its_centre_where_the_ray_through_it_appears()
 
 
 @pytest.mark.parametrize("depth", [0.4, 0.25])
-def test_a_ball_is_found_though_its_stick_hides_some_of_the_rim_and_not_if_half_is_hidden(depth):
+def test_a_ball_is_found_though_its_stick_hides_some_of_the_rim_but_not_half_of_it(depth):
     radius = CAMERA.focal * 0.035 / depth
     for wide, below, whole in (
         (0.25, 0.86, True),

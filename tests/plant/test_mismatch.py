@@ -80,7 +80,7 @@ def test_a_larger_magnitude_goes_further_in_the_same_direction():
     np.testing.assert_allclose(2 * (small.link_scale - 1), large.link_scale - 1, atol=1e-12)
 
 
-def test_an_axis_is_added_to_a_profile_or_stands_instead_of_its_own_and_is_refused_twice():
+def test_an_axis_is_added_to_a_profile_or_replaces_its_own_and_is_refused_twice():
     both, once = (
         Mismatch.parse("moderate+gear_ratio=5%"),
         Mismatch.parse("moderate+camera_rotation=0.5rad"),

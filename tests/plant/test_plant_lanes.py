@@ -126,7 +126,7 @@ def test_an_arm_has_the_same_bits_alone_and_among_others():
 
 
 @pytest.mark.slow
-def test_a_lane_has_the_same_bits_alone_in_another_order_and_after_others_were_dropped(build):
+def test_a_lane_has_the_same_bits_alone_in_another_order_and_after_others_are_gone(build):
     alone = [walk(build(lane), lane) for lane in range(3)]
     assert 0.1 < 1.0 - np.mean(alone[0][2]) < 0.4
     order = np.array([2, 0, 1])

@@ -54,7 +54,7 @@ def test_a_start_of_the_wrong_size_is_refused(entry):
         entry.build(entry.config(), PlantSetup(nominal_ur5(), np.zeros(2), PERIOD))
 
 
-def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_camera(plant):
+def test_a_restored_state_continues_with_the_same_bits_also_after_a_camera_move(plant):
     def continued() -> list[bytes]:
         seen = [plant.step(Command(u)) for u in COMMANDS]
         truth = plant.truth()
@@ -75,9 +75,7 @@ def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_
         assert continued() == expected
 
 
-def test_a_picture_disturbs_neither_the_run_nor_its_random_streams_and_another_seed_is_another_run(
-    plant,
-):
+def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):
     runs, pictures = [], []
     for seed, drawn in ((3, False), (3, True), (8, False)):
         plant.reset(seed)
@@ -92,7 +90,7 @@ def test_a_picture_disturbs_neither_the_run_nor_its_random_streams_and_another_s
         )
 
 
-def test_a_moved_camera_shows_the_ball_elsewhere_as_late_as_its_frames_and_until_the_reset(entry):
+def test_a_moved_camera_shows_the_ball_elsewhere_after_its_latency_until_the_reset(entry):
     config = override("plant", entry.config(), {"sensing": {"latency": 3 * PERIOD}})
     # Far from the point about which the camera turns
     start = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])

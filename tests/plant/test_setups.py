@@ -192,7 +192,7 @@ def test_a_camera_that_loses_the_ball_makes_its_own_features_invalid_only():
     assert model.valid_at(high[None])[:2].tolist() == [False, False]
 
 
-def test_draws_of_the_optics_stay_within_their_magnitudes_and_do_not_depend_on_the_number_of_cameras():
+def test_draws_of_the_optics_stay_within_their_magnitudes_for_any_number_of_cameras():
     mismatch = Mismatch.parse("focal=10%+centre=8px+distortion=5%+mount=4deg+camera_rotation=30deg")
     two = [draw_cameras(mismatch, 2, seed) for seed in range(200)]
     focal = np.array([each.focal for each in two])
@@ -318,7 +318,7 @@ def test_functions_that_break_their_contract_are_refused(changes, message):
         ).check()
 
 
-def test_lengths_have_a_natural_size_and_other_units_need_one_and_single_features_a_point():
+def test_units_other_than_lengths_need_a_natural_size_and_single_features_a_point():
     for unit, metre in (("mm", 1000.0), ("cm", 100.0), ("m", 1.0)):
         assert replace(SETUPS["position"], unit=unit).channel(500.0, 2.0).scale == metre
     with pytest.raises(

@@ -105,7 +105,7 @@ def test_a_run_that_ended_early_takes_its_seed_out_of_the_median(tmp_path):
     assert not ensemble.mostly_ended
 
 
-def test_a_move_is_shown_until_its_slowest_method_has_settled_and_then_half_as_long_again(tmp_path):
+def test_a_move_is_shown_for_one_and_a_half_settling_times_of_its_slowest_method(tmp_path):
     quick = seeds_of(tmp_path / "a", [1.0], settling_time_s=0.6)
     slow = seeds_of(tmp_path / "b", [1.0, 1.0, 1.0], "rls", settling_time_s=1.2)
     never = seeds_of(tmp_path / "c", [1.0], "broyden", settling_time_s=math.nan)
@@ -208,7 +208,7 @@ def test_a_desired_curve_and_its_direction_are_drawn():
         )
 
 
-def test_speed_acceleration_and_jerk_of_every_joint_stand_side_by_side_in_a_row_a_method():
+def test_speed_acceleration_and_jerk_of_joints_stand_side_by_side_in_a_row_a_method():
     steps = made_up_steps("a").assign(joint_velocity_command_lift_rad_s=np.tile([1.0, -1.0], 30))
     row = made_up_row("a", command_switches=59.0, joint_jerk_rms_rad_s3=1131.4)
     figure = draw_joint_motion(

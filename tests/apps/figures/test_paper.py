@@ -78,7 +78,7 @@ def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     )
 
 
-def test_the_paragraph_on_methods_ends_its_tools_with_python_where_no_packages_are_listed():
+def test_the_paragraph_on_methods_names_python_alone_where_no_packages_are_listed():
     runs = pd.DataFrame([made_up_row("a", seed=3)])
     text = methods_paragraph({"python": "3.11.7", "created": "2026-11-28"}, runs)
     start = r"All runs were made with servobench unknown~\cite{servobench} "

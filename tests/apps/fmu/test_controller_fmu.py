@@ -142,7 +142,7 @@ def test_time_that_is_a_sum_of_steps_misses_no_sample(first, step):
 
 
 @pytest.mark.parametrize("step", [1e6, 1e300])
-def test_a_step_of_more_samples_than_anybody_waits_for_is_refused_and_changes_nothing(step):
+def test_a_step_of_more_samples_than_one_waits_for_is_refused_and_changes_nothing(step):
     inputs, commands = original("ukf_mfac:published")
     with loaded("ukf_mfac:published", 2) as controller:
         np.testing.assert_allclose(controller.answer(0, inputs[0]), commands[0], rtol=0, atol=1e-12)

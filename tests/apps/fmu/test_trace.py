@@ -121,7 +121,7 @@ class Count(NamedTuple):
     history: np.ndarray
 
 
-def test_a_recorded_system_goes_the_way_of_the_code_and_the_code_computes_with_numbers_afterwards():
+def test_a_recorded_system_goes_the_way_of_its_code_and_leaves_it_computing_numbers():
     def start(system, u):
         return Count(np.zeros(()) + u["x"][0], np.full((2,), np.nan))
 

@@ -42,7 +42,7 @@ def test_the_checker_finds_nothing_to_warn_of(plant, task, tmp_path):
 
 
 @NEEDS_MUJOCO
-def test_a_run_that_fails_at_its_start_terminates_with_the_first_step_and_the_next_episode_runs():
+def test_a_failed_start_terminates_with_the_first_step_and_the_next_episode_runs():
     env = ServoEnv("mujoco", "singular_start")
     seen, info = env.reset(seed=FAILS_AT_ONCE)
     assert seen in env.observation_space

@@ -123,7 +123,7 @@ def test_an_mfac_controller_is_linearised_as_its_closed_form_says():
     np.testing.assert_allclose(controller.D, np.hstack([-gain, np.zeros((6, 6)), gain]), atol=1e-7)
 
 
-def test_a_model_has_the_age_of_slow_frames_beside_the_latency_and_names_what_it_leaves_out(caplog):
+def test_a_model_has_the_age_of_slow_frames_and_names_what_it_leaves_out(caplog):
     remark.cache_clear()
     sensing, mechanics = (
         SensingConfig(latency=0.1, frame_period=0.4, jitter=0.2),

@@ -180,7 +180,7 @@ def test_the_smallest_type_of_every_figure_can_be_read(browser, pages, name, wid
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_no_word_of_a_programming_language_stands_in_a_page_and_every_link_leads_somewhere(
+def test_a_page_has_no_word_of_a_programming_language_and_no_link_that_leads_nowhere(
     browser, pages, name
 ):
     show(browser, pages[name])

@@ -152,7 +152,7 @@ def test_a_served_position_is_approached():
         (-7, [], "ended at - (command -7), which is not served"),
     ],
 )
-def test_a_command_that_cannot_be_carried_out_ends_the_program_by_name_and_the_arm_stands(
+def test_a_command_that_cannot_be_obeyed_ends_the_program_by_name_and_the_arm_stands(
     number, values, said
 ):
     with served() as (server, address, lines), commanding(server, address) as client:
@@ -516,7 +516,7 @@ def test_a_browser_closes_its_connection_with_its_first_line_and_nothing_moves(
     assert not any("control program" in each for each in lines[-len(FOREIGN) :])
 
 
-def test_the_script_port_keeps_a_client_whose_script_is_not_served_and_reads_it_in_pieces(
+def test_the_script_port_keeps_a_client_of_an_unserved_script_and_reads_it_in_pieces(
     lockstep, monkeypatch
 ):
     _, address, lines = lockstep

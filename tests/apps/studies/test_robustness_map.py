@@ -150,7 +150,7 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, figures):
     [("kinematic", "ur5", ["constant"]), ("kinematic", "twin.toml", []),
      pytest.param("mujoco", "ur5", [], marks=NEEDS_MUJOCO)],
 )  # fmt: skip
-def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_twins_and_rendered_arms(
+def test_limits_are_predicted_for_kinematic_joints_not_for_twins_and_rendered_arms(
     monkeypatch, tmp_path, plant, robot, predicted
 ):
     pose = "pose = {frame = 'base', position = [0.4, 0.1, 2.2], rotation = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]}"
@@ -227,7 +227,7 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
     assert "half of the runs or more never settle" in figures[1].get_suptitle()
 
 
-def test_a_map_of_another_arm_and_of_pixels_has_them_at_every_place_and_its_own_prediction():
+def test_a_map_of_another_arm_and_pixels_has_them_everywhere_and_its_own_prediction():
     cells = map_cells(replace(SMALLEST, robot="panda", sensings=("stereo:hand",)))
     assert {(cell.request.robot, cell.request.sensing) for cell in cells} == {
         ("panda", "stereo:hand")

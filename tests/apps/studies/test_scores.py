@@ -33,7 +33,7 @@ def test_a_score_is_the_floored_reference_over_the_floored_own_value():
             scores(own, reference, floor)
 
 
-def test_an_interquartile_mean_is_the_mean_of_the_middle_half_of_all_challenges_together():
+def test_an_interquartile_mean_is_that_of_the_middle_half_of_all_challenges_together():
     table = tidy("score", {"a": {"x": [0.0, 0.1, 0.2, 0.9], "y": [0.3, 0.4, 1.0, 1.0]}})
     middle = ranking(table)[0].score
     assert middle.value == pytest.approx((0.2 + 0.3 + 0.4 + 0.9) / 4)
@@ -59,7 +59,7 @@ def test_the_interval_is_scipys():
     assert (middle.low, middle.high) == pytest.approx((low, high), abs=0.05 * (high - low))
 
 
-def test_methods_that_cannot_be_told_apart_share_a_rank_and_the_next_one_has_its_place():
+def test_methods_that_cannot_be_told_apart_share_a_rank_and_the_next_keeps_its_place():
     generator = np.random.default_rng(1)
     robots = generator.uniform(0.4, 0.8, 60)
     values = {

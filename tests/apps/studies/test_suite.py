@@ -194,7 +194,7 @@ def test_scores_of_moves_come_out_as_by_hand():
     assert row["median"]["value"] == 2.0
 
 
-def test_scores_of_curves_are_in_millimetres_with_a_floor_and_need_a_reference_on_the_robot():
+def test_scores_of_curves_are_in_millimetres_with_a_floor_and_need_a_reference():
     values = {
         "mine": [0.001, 0.006, 0.011, 0.004],
         "calibrated": [0.0005, 0.002, 0.02],
@@ -208,7 +208,7 @@ def test_scores_of_curves_are_in_millimetres_with_a_floor_and_need_a_reference_o
     assert MEASURES["path"].floor == 0.0015
 
 
-def test_scores_of_sequences_are_of_their_later_moves_whether_or_not_the_first_one_settled():
+def test_scores_of_sequences_are_of_later_moves_whether_or_not_the_first_one_settled():
     values = {"mine": [0.8, 2.0, -1.0, math.nan], "calibrated": [0.4, 3.0, 1.0, 1.0]}
     runs = table_of(values, "settling_time_later_s", "sequence", 0.005).assign(
         outcome="not_settled"
@@ -231,7 +231,7 @@ def test_a_world_with_stamps_differs_from_that_without_by_them_alone(name):
 
 
 @pytest.mark.parametrize("name", sorted(LATER))
-def test_a_world_of_later_moves_differs_from_that_of_single_ones_by_task_and_measure_alone(name):
+def test_a_world_of_later_moves_differs_from_single_ones_by_task_and_measure_alone(name):
     own = find_challenge(name)
     world, _, task = name.rpartition("_")
     single = find_challenge(world)
@@ -301,7 +301,7 @@ def test_a_reference_of_some_challenges_only_has_no_rank():
 
 
 @pytest.mark.slow
-def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_stopped(
+def test_the_command_scores_methods_in_ones_own_world_and_goes_on_where_it_stopped(
     refusal_of, output_of, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(tmp_path)

@@ -142,7 +142,7 @@ def test_settings_are_nested_and_rounded_to_three_digits():
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_best_equipped_methods_have_the_words_of_the_aids_as_switches_and_published_ones_none(name):
+def test_best_equipped_methods_have_the_aids_as_switches_and_published_ones_none(name):
     words = {
         key.removeprefix("aids.")
         for key, values in SPACES[name].items()
@@ -154,7 +154,7 @@ def test_best_equipped_methods_have_the_words_of_the_aids_as_switches_and_publis
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_the_first_points_hold_the_defaults_the_values_in_use_and_every_value_of_every_switch(name):
+def test_the_first_points_hold_defaults_values_in_use_and_every_value_of_a_switch(name):
     entry, space, points = find_tunable(name), find_space(name), first_points(name)
     settings = [nested_settings(point) for point in points]
     assert len(space) >= 3
@@ -199,7 +199,7 @@ def test_tuned_files_do_not_matter_to_a_trial():
     assert default_config(find_tunable("rls:published")) != find_tunable("rls:published").config()
 
 
-def test_every_run_has_a_robot_of_its_own_and_every_model_and_level_occurs_equally_often():
+def test_every_run_has_its_own_robot_and_every_model_and_level_occurs_equally_often():
     chosen = TuningSet(robots=4, offset=100)
     runs, worlds = chosen.runs(), chosen.runs()[::4]
     assert [run.seed for run in runs] == list(
@@ -273,7 +273,7 @@ def test_the_cost_of_a_run_computed_by_hand(task, row, cost):
     assert np.mean([WEIGHTS[each] for each, _ in KINDS]) == pytest.approx(1.0)
 
 
-def test_the_cost_of_a_move_is_continuous_where_settling_is_not_and_orders_runs_by_speed_and_rest():
+def test_the_cost_of_a_move_is_continuous_and_orders_runs_by_speed_and_rest():
     """An approach exp(−t/τ), a rest, and an error that comes back for a tenth of a second before the end."""
     times = np.arange(0.0, 6.0, 0.05)
 
@@ -311,9 +311,7 @@ def test_a_better_tuned_controller_has_the_better_score():
 
 
 @pytest.mark.parametrize("name", CHECKED)
-def test_committed_values_reach_the_score_that_their_file_states_and_studies_beat_the_defaults(
-    name,
-):
+def test_committed_values_reach_the_score_in_their_file_and_studies_beat_defaults(name):
     tuned = read_tuned(TUNED[name])
     assert tuned.controller.replace(":", ".") == name
     runs = [tuning_set(tuned).runs()[index] for index in tuning_set(tuned).checked()]

@@ -112,7 +112,7 @@ def test_the_coordinate_search_keeps_to_its_budget_and_keeps_the_best_so_far():
         (IntDistribution(3, 10), 3, [4]),
     ],
 )
-def test_switches_take_their_other_values_and_numbers_a_step_of_a_fifth_within_their_range(
+def test_switches_take_their_other_values_and_numbers_a_step_of_a_fifth_within_range(
     distribution, value, tried
 ):
     assert changes(distribution, value) == (
@@ -128,7 +128,7 @@ def test_the_defaults_come_first_and_no_two_trials_are_alike(made_up, tmp_path):
     assert method.studies[0].outcome.search_points == 0
 
 
-def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still_better_ones(
+def test_the_sampler_finds_better_values_than_known_and_the_search_still_better_ones(
     made_up, tmp_path
 ):
     known = len(first_points("broyden"))
@@ -216,9 +216,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     assert tuned.checked_score == pytest.approx(score([costs[index] for index in first]))
 
 
-def test_the_study_that_is_best_on_the_second_set_is_the_one_in_use_of_a_division_too(
-    made_up, tmp_path
-):
+def test_the_study_that_is_best_on_the_second_set_is_in_use_for_a_division_too(made_up, tmp_path):
     plan = plan_of("rls:published", trials=len(first_points("rls:published")) + 15, studies=3)
     methods = carried_out(tmp_path, plan)
     (tuned,) = write_results(tmp_path, methods).values()
@@ -243,7 +241,7 @@ def test_no_result_is_written_before_every_study_has_ended(made_up, tmp_path):
     assert write_results(tmp_path, methods) == {}
 
 
-def test_no_result_is_written_before_every_known_value_has_its_score_on_the_second_set(
+def test_no_result_is_written_before_all_known_values_have_scores_on_the_second_set(
     made_up, tmp_path
 ):
     plan = plan_of("rls", trials=len(first_points("rls")) + 2)

@@ -608,9 +608,7 @@ def test_the_period_of_a_camera_and_lost_frames_are_told_apart(frame, period, lo
     assert lost_share(log) == pytest.approx(lost, abs=0.03)
 
 
-def test_a_twin_has_the_rate_and_the_latency_of_a_camera_that_is_no_multiple_of_the_control_period(
-    tmp_path,
-):
+def test_a_twin_has_the_rate_and_latency_of_a_camera_at_no_multiple_of_the_period(tmp_path):
     settings = {
         "kinematic": {"sensing": {"latency": 0.08, "frame_period": 0.066}},
         "run": {"period": 0.02},
@@ -629,9 +627,7 @@ def test_a_twin_has_the_rate_and_the_latency_of_a_camera_that_is_no_multiple_of_
 
 
 @pytest.mark.slow
-def test_two_mistakes_are_named_together_and_a_log_that_they_do_not_explain_is_refused(
-    monkeypatch,
-):
+def test_two_mistakes_are_named_together_and_a_log_they_do_not_explain_is_refused(monkeypatch):
     log, _, model = logged()
     order = np.argsort(np.argsort(log.spec.joint_names))
     both = log._replace(joints=log.joints[:, order], features=log.features * (1, 1, -1))
