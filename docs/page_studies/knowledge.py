@@ -11,7 +11,7 @@ import pandas as pd
 
 from page_studies import cells
 from page_studies.study import SUFFIX, Study, Words, settings
-from page_studies.worlds import interval_scored, suite
+from page_studies.worlds import interval_scored, suite, variance_shares
 from servobench.controllers.aids import EQUIPPED
 from servobench.controllers.methods import LAWS
 from servobench.harness.apps.studies.challenge import find_challenge
@@ -130,11 +130,31 @@ def _rows(
             yield row
 
 
+def _explained(judged: pd.DataFrame) -> Iterator[dict[str, str]]:
+    """Yield what share of the variance of scores goes with what is known, and with the law [%]."""
+    law = judged["controller"].str.partition("+")[0]
+    scores = judged[["challenge", "score"]]
+    seed = judged["seed"].astype(str)
+    # What is asked about takes the place of the method; the other one is part of the robot.
+    by_knowledge = scores.assign(controller=judged["part"], seed=seed + law)
+    by_law = scores.assign(controller=law, seed=seed + judged["part"])
+    for title, rows in (("what is known or learned", by_knowledge), ("law", by_law)):
+        shares = variance_shares(rows)
+        yield {
+            "explained by": title,
+            "in all worlds, %": f"{100.0 * shares['method']:.1f}",
+            "by world, %": f"{100.0 * shares['method in a world']:.1f}",
+        }
+
+
 def known_tables(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the scores by knowledge and law, a row a world and knowledge, and the ladder of two methods."""
-    by_knowledge = _rows(scored_runs(folder, KNOWN), KNOWN, "known or learned")
-    by_rung = _rows(scored_runs(folder, RUNGS), RUNGS, "aids")
-    return {"known": pd.DataFrame(by_knowledge), "known_ladder": pd.DataFrame(by_rung)}
+    """Return scores by knowledge and law, what explains their variance, and the ladder of two methods."""
+    judged = scored_runs(folder, KNOWN)
+    return {
+        "known": pd.DataFrame(_rows(judged, KNOWN, "known or learned")),
+        "known_shares": pd.DataFrame(_explained(judged)),
+        "known_ladder": pd.DataFrame(_rows(scored_runs(folder, RUNGS), RUNGS, "aids")),
+    }
 
 
 KNOWN_STUDY: Final = Study(
