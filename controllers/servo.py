@@ -209,8 +209,8 @@ class Servo:
                 drift = seen.drift
                 if not self._feeds_forward:
                     # A law with a preview of its own sees the reference move against the drift.
-                    ahead_of_now = np.arange(self._rows)[:, None]
-                    later = later - ahead_of_now * drift[..., None, :]
+                    periods = np.arange(self._rows)[:, None]
+                    later = later - periods * drift[..., None, :]
         law, wanted = self._command(state, estimation, J, ahead, later)
         if not is_finite(wanted):
             raise ControllerDiverged(

@@ -112,12 +112,31 @@ class Log(NamedTuple):
     valid: BoolArray  # (k,) whether a row has a new frame
     # (k, n) [rad/s], each from its row to the next; velocities of the joints are those of a spline
     commands: FloatArray | None
-    frame_time: FloatArray  # (k,) [s] when the frame of a row came, or by its stamp would have come at the mean latency
+    captured: (
+        FloatArray  # (k,) [s] when frames were exposed by the camera's clock; NaN without a stamp
+    )
+
+    @property
+    def stamped(self) -> BoolArray:
+        """Which rows have a new frame with a stamp, (k,)."""
+        return np.asarray(self.valid & np.isfinite(self.captured))
 
     @property
     def lateness(self) -> FloatArray:
-        """By how much each frame came later than at the mean latency, (k,) [s]; 0 without stamps."""
-        return self.time - self.frame_time
+        """By how much each stamped frame came later than they do in the mean, (k,) [s]; 0 for others.
+
+        The mean takes the unknown offset of the camera's clock away; its drift is a parameter (`drift`).
+        """
+        stamped = self.stamped
+        if not stamped.any():
+            return np.zeros(len(self.time))
+        late = self.time - self.captured
+        return np.where(stamped, late - np.mean(late[stamped]), 0.0)
+
+    @property
+    def frame_time(self) -> FloatArray:
+        """When the frames of rows came, or by their stamps would have come at the mean latency, (k,) [s]."""
+        return self.time - self.lateness
 
     def farthest_joint(self) -> tuple[float, str]:
         """Return how far a joint is beyond its range at most [rad], and where that is."""
@@ -218,7 +237,6 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
         marked = numbers_of(LOG, table, ["feature_valid"])[:, 0]
     valid = (marked != 0.0) & ~lost.to_numpy()
     time = np.asarray(spec.period * rows)
-    frame_time = _frame_times(table, time, valid)
     commands = None
     lacking = [name for name in names[COMMAND] if name not in table]
     if not lacking:
@@ -226,7 +244,8 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     elif any(str(name).startswith(VELOCITY) for name in table):
         missing = ", ".join(lacking)
         remark(f"the log has columns {VELOCITY}_… but no {missing}: commands are left out")
-    log = Log(spec, time, joints, features, valid, commands, frame_time)
+    log = Log(spec, time, joints, features, valid, commands, _stamps(table))
+    _check_clock(log)
     count = len(frames_of(log))
     if count < least:
         after = f"after the first {MAX_LATENCY:g} s"
@@ -235,28 +254,26 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     return log
 
 
-def _frame_times(table: pd.DataFrame, time: FloatArray, valid: BoolArray) -> FloatArray:
-    """Return when the frames of rows came, (k,) s; for stamped ones, when they would have come at the mean latency.
-
-    The camera's clock has an unknown offset, which the mean takes away; its drift is a parameter (`drift`).
-
-    Raises:
-        ConfigurationError: the stamps run faster or slower than the rows, as in another unit.
-    """
+def _stamps(table: pd.DataFrame) -> FloatArray:
+    """Return the stamps of the frames of rows, (k,) [s]; NaN for none."""
     if CAPTURED not in table:
-        return time
-    captured = table[CAPTURED].to_numpy(np.float64)
-    stamped = valid & np.isfinite(captured)
+        return np.full(len(table), np.nan)
+    given = table[CAPTURED].notna().to_numpy()
+    filled = table.assign(**{CAPTURED: table[CAPTURED].where(given, 0.0)})
+    return np.where(given, numbers_of(LOG, filled, [CAPTURED])[:, 0], np.nan)
+
+
+def _check_clock(log: Log) -> None:
+    """Refuse stamps that run faster or slower than the rows, as in another unit."""
+    stamped = log.stamped
     if not stamped.any():
-        return time
-    lateness = (time - captured)[stamped]
-    span = float(np.ptp(time[stamped]))
-    if np.ptp(lateness) > MAX_LATENESS_RANGE + MAX_CLOCK_DRIFT * span:
-        stamps = float(np.ptp(captured[stamped]))
+        return
+    rows = float(np.ptp(log.time[stamped]))
+    stamps = float(np.ptp(log.captured[stamped]))
+    if np.ptp(log.lateness[stamped]) > MAX_LATENESS_RANGE + MAX_CLOCK_DRIFT * rows:
         raise ConfigurationError(
-            f"{CAPTURED} of {LOG} runs {stamps:.4g} s while its rows run {span:.4g} s: write stamps in seconds"
+            f"{CAPTURED} of {LOG} runs {stamps:.4g} s while its rows run {rows:.4g} s: write stamps in seconds"
         )
-    return np.where(stamped, captured + np.mean(lateness), time)
 
 
 def frames_of(log: Log, most: int = sys.maxsize) -> Any:  # noqa: ANN401 - of indices
@@ -590,7 +607,7 @@ def fitted_wave(
     if not fits:
         return None
     left, pace, best = min(fits)
-    return pace, np.array(best), left / float(np.sum(target**2))
+    return pace, np.array(best), left / max(float(np.sum(target**2)), 1e-18)
 
 
 def _sees_pixels(model: RobotModel) -> bool:

@@ -36,7 +36,6 @@ class LoggedPlant(Plant):
         self.reference = numbers_of(LOG, table, column_names(spec)["reference"])
         if not self.log.valid.any():
             raise ConfigurationError("the log has no row whose feature_valid is 1 or true")
-        self._captured = table.reindex(columns=["capture_time_s"]).to_numpy(np.float64)[:, 0]
         self._true = table.reindex(columns=column_names(spec)["true_feature"]).to_numpy(np.float64)
 
     def reset(self, seed: int) -> Observation:
@@ -58,7 +57,7 @@ class LoggedPlant(Plant):
             log.joints[k],
             log.features[k],
             bool(log.valid[k]),
-            capture_time=self._captured[k],
+            capture_time=log.captured[k],
         )
 
     def truth(self) -> Truth:

@@ -105,10 +105,10 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     swing = math.hypot(certain.get("swing_sin", 0.0), certain.get("swing_cos", 0.0))
     lateness = _lateness(log, robot)
     swing_period = robot.swing_period
-    stamped = log.lateness[robot.rows]
-    if stamped.any():
+    if log.stamped.any():
         sensing["stamps"] = True
-        wave = fitted_wave(log.frame_time[robot.rows], stamped, np.ones_like(stamped))
+        late = log.lateness[log.stamped]
+        wave = fitted_wave(log.frame_time[log.stamped], late, np.ones_like(late))
         if wave is not None and wave[-1] < MAX_WAVE_REST:
             pace, sizes, _ = wave
             swing = float(np.linalg.norm(sizes))
@@ -177,9 +177,9 @@ class _Lateness(NamedTuple):
 
 def _lateness(log: Log, robot: Identified) -> _Lateness:
     """Return the lateness of frames: by their stamps, or σ² as the slope of ‖e‖² over ‖ẏ‖²."""
-    stamped = log.lateness[robot.rows]
-    if stamped.any():
-        return _Lateness(float(stamped.std()), robot.noise, robot.inliers)
+    if log.stamped.any():
+        deviation = float(log.lateness[log.stamped].std())
+        return _Lateness(deviation, robot.noise, robot.inliers)
     speed = np.sum(robot.rates(log) ** 2, axis=1)  # ‖ẏ‖²
     square = np.sum(robot.residuals**2, axis=1)  # ‖e‖²
     slow = robot.inliers & (speed <= np.quantile(speed, SLOW_SHARE))

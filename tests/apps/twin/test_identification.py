@@ -431,7 +431,7 @@ def test_frames_of_a_short_log_and_of_the_same_laps_again_and_again_are_no_mista
     short = log._replace(
         **{
             name: getattr(log, name)[:80]
-            for name in ("time", "joints", "features", "valid", "frame_time")
+            for name in ("time", "joints", "features", "valid", "captured")
         }
     )
     assert short.frame_mistake() == ""
