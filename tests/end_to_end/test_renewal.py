@@ -19,7 +19,7 @@ from kit.documents import ROOT
 from kit.documents import tables as page_tables
 from kit.nightly import NIGHTLY, some
 from kit.own import write
-from page_studies import STUDIES, cells, held_out, physical, pictures, worlds
+from page_studies import STUDIES, cells, held_out, knowledge, physical, pictures, worlds
 from page_studies.pictures import README
 from page_studies.study import ENGINES, Study, nothing, sweep
 from servobench.harness.apps.studies import robustness
@@ -252,7 +252,9 @@ def lay_out_suite(folder):
     methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN, *worlds.LEARNED_BY))
     pd.DataFrame([{**own, "controller": name} for name in methods]).to_csv(folder / "methods.csv")
     scores = [
-        {**own, "controller": name, "score": score} for name in methods for score in (0.4, 0.6)
+        {**own, "controller": name, "seed": seed, "score": score}
+        for name in methods
+        for seed, score in enumerate((0.4, 0.6))
     ]
     pd.DataFrame(scores).to_csv(folder / "scores.csv")
     rank = {
@@ -450,3 +452,27 @@ def test_the_variance_of_scores_is_shared_out(value, expected):
     assert {name: share for name, share in shares.items() if share > 1e-12} == pytest.approx(
         expected
     )
+
+
+def test_knowledge_is_judged_by_references_that_all_parts_share(monkeypatch):
+    errors = {
+        "references": {"calibrated": 0.002, "nmpc_calibrated": 0.003, "constant": 0.9},
+        "arm": {"mfac+constant": 0.004, "calibrated": 0.1},
+    }
+
+    def runs(path: Path) -> pd.DataFrame:
+        rows = [
+            {
+                "plant": "kinematic", "controller": name, "seed": seed, "status": "completed",
+                "outcome": "followed", "rms_error_evaluated": error,
+            }
+            for name, error in errors[path.parent.name].items()
+            for seed in (0, 1)
+        ]  # fmt: skip
+        return pd.DataFrame(rows)
+
+    monkeypatch.setattr(knowledge, "load_runs", runs)
+    judged = knowledge.scored_runs(Path("known"), ["arm"])
+    assert set(judged["controller"]) == {"mfac+constant"}
+    assert len(judged) == 2 * len(knowledge.WORLDS)
+    np.testing.assert_allclose(judged["score"], 0.5)
