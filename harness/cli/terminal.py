@@ -78,9 +78,9 @@ def ending_alike() -> Iterator[list[int]]:
         if callable(handler) and handler != interrupt:
             handler(signal.SIGINT, frame)
             return
-        start()
+        raise_interrupt()
 
-    def start() -> None:
+    def raise_interrupt() -> None:
         error = _Interrupt()
         raised.append(weakref.ref(error))
         signal.setitimer(signal.ITIMER_REAL, SOON)
@@ -93,16 +93,16 @@ def ending_alike() -> Iterator[list[int]]:
         # One that is on its way, or that a handler or clean-up was called for, is alive.
         return bool(raised) and raised[-1]() is None
 
-    def look(_number: int, _frame: FrameType | None) -> None:
+    def raise_lost_again(_number: int, _frame: FrameType | None) -> None:
         if is_lost():
-            start()
+            raise_interrupt()
         signal.setitimer(signal.ITIMER_REAL, SOON)
 
     def report(unraisable: sys.UnraisableHookArgs) -> None:
         if unraisable.exc_type is not _Interrupt:
             hook(unraisable)
 
-    handlers = {signal.SIGINT: interrupt, signal.SIGALRM: look}
+    handlers = {signal.SIGINT: interrupt, signal.SIGALRM: raise_lost_again}
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:
             handlers[number] = interrupt

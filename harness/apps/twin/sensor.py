@@ -22,7 +22,7 @@ CERTAIN: Final = (
     5.0  # [1] deviations from none that make backlash, ripple, a soft tool and the like certain
 )
 MIN_JITTER: Final = 0.02  # [s] by which frames must be late by changing times
-MAX_WAVE_REST: Final = (
+WAVE_RESIDUAL_SHARE: Final = (
     0.3  # [1] share of the squares of stamped latenesses that a wave leaves where they swing
 )
 MAX_JITTER: Final = 0.05  # [s] deviation of these times that makes no outliers
@@ -109,7 +109,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
         sensing["stamps"] = True
         late = log.lateness[log.stamped]
         wave = fitted_wave(log.frame_time[log.stamped], late, np.ones_like(late))
-        if wave is not None and wave[-1] < MAX_WAVE_REST:
+        if wave is not None and wave[-1] < WAVE_RESIDUAL_SHARE:
             pace, sizes, _ = wave
             swing = float(np.linalg.norm(sizes))
             swing_period = 2.0 * math.pi / pace
