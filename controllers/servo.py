@@ -16,7 +16,12 @@ from servobench.controllers.controller import Controller, Delays, Diagnostics, R
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial_jacobian import InitialJacobian
 from servobench.controllers.laws.law import Estimate, Law
-from servobench.controllers.stages.calibration import Ahead, Calibration, CalibrationState
+from servobench.controllers.stages.calibration import (
+    Ahead,
+    Calibration,
+    CalibrationState,
+    Regressed,
+)
 from servobench.controllers.stages.estimation import REGRESSED, Estimation, EstimationState
 from servobench.controllers.stages.finish import Finish
 from servobench.controllers.stages.prediction import Predictor, PredictorState, shifted
@@ -243,11 +248,12 @@ class Servo:
             raise ValueError("aids: model='arm' needs the pair stage")
         pair = estimation.learned.pair
         due = np.equal(estimation.last.time, observation.time)
-        regression = (
-            predictor.feature,
-            estimation.jacobian,
-            pairing.delay(pair) * self.knowledge.spec.period,
-            pair.noise.deviation,
+        regression = Regressed(
+            feature=predictor.feature,
+            jacobian=estimation.jacobian,
+            delay=pairing.delay(pair) * self.knowledge.spec.period,
+            deviation=pair.noise.deviation,
+            moves=pair.regression.moves,
         )
         return self.calibration.update(state.calibration, observation, due, regression, pair.late)
 

@@ -77,6 +77,7 @@ class Members(NamedTuple):
     """The ensemble of fits; E members."""
 
     theta: FloatArray  # θ, (..., E, P)
+    centre: FloatArray  # θ about which the priors are, (..., E, P): 0, and what was known when a camera was moved
     cameras: FloatArray  # (..., E, c, 4, 4)
     latency: FloatArray  # L, (..., E) [s]
     turning: FloatArray  # ω, (..., E) [rad/s]
@@ -169,6 +170,18 @@ def first(frames: Frames, most: int) -> Frames:
     return each_row(frames, lambda array: array.take(kept, axis=axis))
 
 
+def last(frames: Frames, most: int) -> Frames:
+    """Return the buffer with the last frames alone, `most` at most."""
+    rows = np.arange(FRAMES)
+    number = np.minimum(frames.number, most)
+    behind = (frames.number - number)[..., None]
+    kept = np.minimum(rows + behind, FRAMES - 1)
+    fewer = each_row(frames, lambda array: pick(array, kept, axes=1))
+    there = rows < number[..., None]
+    weight = fewer.weight * there[..., None]
+    return fewer._replace(weight=weight, number=number)
+
+
 def whitened(
     fitted: Fitted, lateness: FloatArray, variance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -259,9 +272,11 @@ class Fit:
         classes = each % len(self._spreads)
         planned = self._planned
         size = (*lead, count)
+        theta = self._draws[rows] * self._spreads[classes]
         late = np.asarray(latency)[..., None]
         return Members(
-            theta=self._draws[rows] * self._spreads[classes],
+            theta=theta,
+            centre=np.zeros_like(theta),
             cameras=np.broadcast_to(planned, (*size, *planned.shape)),
             latency=np.repeat(late, count, axis=-1),
             turning=np.zeros(size),
@@ -321,7 +336,7 @@ class Fit:
         return cost, square
 
     def _prior_cost(self, members: Members) -> FloatArray:
-        relative = members.theta / self._cores
+        relative = (members.theta - members.centre) / self._cores
         cost = np.add.reduce(2.0 * np.log1p(relative * relative), axis=-1)
         offset = (members.latency - LATENCY[0]) / LATENCY[1]
         cost = cost + 0.5 * offset * offset
@@ -338,7 +353,7 @@ class Fit:
 
     def _prior_slope(self, members: Members) -> tuple[FloatArray, FloatArray]:
         """Return the prior's information, (..., E, P + 2), and its pull on each parameter."""
-        theta = members.theta
+        theta = members.theta - members.centre
         bounded = np.isfinite(self._cores)
         own = np.where(bounded, 2.0 / (self._cores**2 + theta * theta), 0.0)
         pull = -own * theta

@@ -15,6 +15,7 @@ from servobench.controllers.choice import choose
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.arm_fit import (
+    FIRST_DAMPING,
     FLOOR,
     FRAMES,
     Fit,
@@ -25,11 +26,13 @@ from servobench.controllers.stages.arm_fit import (
     added,
     at_latency,
     first,
+    last,
     squared,
     whitened,
     without_rates,
 )
 from servobench.controllers.stages.pairing import MAX_LATENESS, rows_ago
+from servobench.controllers.stages.regression import MOVED_FRAMES
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
@@ -56,6 +59,7 @@ MIN_TRAVEL: Final = 2.0  # [rad] motion of all joints before it is
 EXPLAINED: Final = 1.3  # [1] residuals in σ up to which frames are explained
 LEAST_LATENESS: Final = 0.012  # [s] below which there is none
 FAST: Final = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
+BROKEN: Final = 3.0  # [1] least error of a frame in σ that tells a moved camera
 UNEXPLAINED: Final = 1.6  # [1] residuals in σ from which on new members are tried
 LAST_TRIAL: Final = 30.0  # [s]
 MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
@@ -63,6 +67,16 @@ MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
 CANDIDATES: Final = 8  # new members that are tried at once
 TRIAL_ITERATIONS: Final = 12  # iterations of a trial
 ITERATIONS_A_FRAME: Final = 2  # iterations of a trial at each frame
+
+
+class Regressed(NamedTuple):
+    """What the regression says at a frame, in natural units."""
+
+    feature: FloatArray  # without its noise, (..., m)
+    jacobian: FloatArray  # (..., m, n)
+    delay: FloatArray  # latency of frames, (...) [s]
+    deviation: FloatArray  # σ of their noise, (...)
+    moves: IntArray  # how often the camera seems to have been moved, (...)
 
 
 class Known(NamedTuple):
@@ -75,6 +89,7 @@ class Known(NamedTuple):
     jacobian: FloatArray  # the regression's, (..., m, n)
     exposed: FloatArray  # joint position at the exposure, by the regression's delay, (..., n)
     fitted: BoolArray  # (...), whether the members had been fitted
+    moves: IntArray  # the regression's, (...)
 
 
 class Trial(NamedTuple):
@@ -103,6 +118,7 @@ class CalibrationState(NamedTuple):
     travel: FloatArray  # (...) [rad] sum of the joints' motion
     errors: FloatArray  # mean squares of the prediction errors of regression and arm, (..., 2); NaN before
     used: BoolArray  # (...), whether the arm is believed
+    moves: IntArray  # those of the regression at the last frame, (...)
     passed: IntArray  # frames since the last iteration, (...)
     spawned: IntArray  # members begun so far, (...)
     trial: Trial
@@ -142,7 +158,7 @@ class Calibration:
         features = np.zeros((*rows, m))
         paths = np.zeros((*rows, fit.rows, n))
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
-        members = fit.spawned(lead, zero, FIRST_MEMBERS, none)
+        members = fit.start(lead, FIRST_MEMBERS, none)
         size = (*lead, FIRST_MEMBERS)
         periods = self._periods
         if np.isfinite(observation.capture_time).any():
@@ -164,6 +180,7 @@ class Calibration:
             travel=none,
             errors=np.full((*lead, 2), np.nan),
             used=no,
+            moves=zero,
             passed=zero,
             spawned=zero + FIRST_MEMBERS,
             trial=Trial(
@@ -179,7 +196,7 @@ class Calibration:
         state: CalibrationState,
         observation: Observation,
         due: BoolArray,
-        regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        regression: Regressed,
         late: FloatArray | None = None,
     ) -> CalibrationState:
         """Return the state at an observation.
@@ -188,7 +205,7 @@ class Calibration:
             state: one period ago.
             observation: of this period.
             due: whether its frame is learned from, (...).
-            regression: its feature without noise (..., m), Jacobian (..., m, n), delay (...) [s] and noise σ (...).
+            regression: at this observation.
             late: by which the frame is known to be later than others, (...) [s]; None where nothing is known.
         """
         q = observation.joint_position
@@ -210,13 +227,13 @@ class Calibration:
         self,
         state: CalibrationState,
         observation: Observation,
-        regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        regression: Regressed,
         past: tuple[Known, ...],
         elapsed: float,
         late: FloatArray | None,
     ) -> CalibrationState:
         """Return the state after a frame."""
-        _, _, delay, deviation = regression
+        delay = regression.delay
         path = self._path(state.history, late)
         lead = state.travel.shape
         time = np.full(lead, elapsed)[()]
@@ -226,13 +243,15 @@ class Calibration:
             instant = time - late
         y = observation.feature
         frames = added(state.frames, instant, y, observation.valid, path)
-        noise = np.clip(deviation, *NOISE)
+        noise = np.clip(regression.deviation, *NOISE)
         known = (state.lateness > 0.0) & (state.across > 0.0)
         across = np.minimum(np.maximum(state.across, NOISE[0]), noise)
         noise = np.where(known, across, noise)
         state = state._replace(frames=frames, noise=noise)
         if past:
-            state = self._judged(state, y, path, instant, delay, past)
+            state, far = self._judged(state, y, path, instant, delay, past)
+            broken = far & (regression.moves > state.moves)
+            state = branch(broken, self._moved, state._replace(moves=regression.moves))
         many = frames.number >= MANY_FRAMES
         level = np.where(
             many & state.fitted, np.minimum(noise, EXPLAINED * state.rms + 0.2e-3), noise
@@ -254,6 +273,20 @@ class Calibration:
             state = branch(tries, self._tried, state, elapsed, level)
         return state
 
+    def _moved(self, state: CalibrationState) -> CalibrationState:
+        """Return the state in which the camera was moved: the arms stay, of the frames the last few."""
+        members = state.members
+        fresh = np.full_like(members.damping, FIRST_DAMPING)
+        return state._replace(
+            frames=last(state.frames, MOVED_FRAMES),
+            members=members._replace(damping=fresh, centre=members.theta),
+            fitted=np.zeros_like(state.fitted),
+            errors=np.full_like(state.errors, np.nan),
+            trial=state.trial._replace(
+                iterations=np.full_like(state.trial.iterations, TRIAL_ITERATIONS)
+            ),
+        )
+
     def _path(self, history: FloatArray, late: FloatArray | None) -> FloatArray:
         """Return joint positions up to `late` (...) [s] ago, (..., J, n), the newest last."""
         stride = self.fit.stride
@@ -271,8 +304,8 @@ class Calibration:
     ) -> CalibrationState:
         """Return the state with members fitted for the first time."""
         frames = self._in_use(state, elapsed)
-        lead = state.travel.shape
-        members = self.fit.start(lead, state.share.shape[-1], delay)
+        late = np.broadcast_to(delay[..., None], state.share.shape)
+        members = state.members._replace(latency=late)
         trial = self._begun_trial(members, frames, noise)
         for _ in range(FIRST_ITERATIONS):
             trial = self._iterated(trial, frames, state.lateness, noise)
@@ -384,8 +417,12 @@ class Calibration:
         instant: FloatArray,
         delay: FloatArray,
         past: tuple[Known, ...],
-    ) -> CalibrationState:
-        """Return the state with the errors of both in predicting a frame from what was known some frames ago."""
+    ) -> tuple[CalibrationState, BoolArray]:
+        """Return the state with the errors of both in predicting a frame from what was known some frames ago.
+
+        And whether the arm's is larger than any lateness explains, (...): late frames are off by a part of the way of
+        the last periods.
+        """
         known = past[0]
         fit = self.fit
         members = known.members
@@ -402,7 +439,12 @@ class Calibration:
         squares = np.minimum(np.vecdot(errors, errors), most)
         mean = MEMORY * state.errors + (1.0 - MEMORY) * squares
         mean = np.where(np.isnan(state.errors), squares, mean)
-        return state._replace(errors=np.where(known.fitted[..., None], mean, state.errors))
+        comparable = known.fitted & (known.moves == state.moves)
+        ways = np.matvec(known.jacobian[..., None, :, :], np.diff(path, axis=-2))
+        way = np.add.reduce(norm(ways), axis=-1)
+        far = norm(errors[..., 1, :]) > BROKEN * state.noise + way
+        new = state._replace(errors=np.where(comparable[..., None], mean, state.errors))
+        return new, np.asarray(known.fitted & far)
 
     def _trusted(self, state: CalibrationState) -> BoolArray:
         gate = GATE * np.where(state.used, HYSTERESIS[1], HYSTERESIS[0])
@@ -460,24 +502,25 @@ class Calibration:
         past: tuple[Known, ...],
         state: CalibrationState,
         due: BoolArray,
-        regression: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        regression: Regressed,
     ) -> tuple[Known, ...]:
         """Return what is known at the last frames, with this one where it is due."""
         # Members become fewer at the same time in all lanes, whether a frame is due or not.
         same_size = bool(past) and past[-1].share.shape == state.share.shape
         if same_size and not np.any(due):
             return past
-        feature, jacobian, delay, _ = regression
         path = self._path(state.history, None)
-        exposed, _ = at_latency(path[..., None, :, :], delay[..., None], self.fit.grid)
+        delay = regression.delay[..., None]
+        exposed, _ = at_latency(path[..., None, :, :], delay, self.fit.grid)
         new = Known(
             state.members,
             state.share,
             state.bias,
-            feature,
-            jacobian,
+            regression.feature,
+            regression.jacobian,
             exposed[..., 0, 0, :],
             state.fitted,
+            regression.moves,
         )
         if not past:
             return (new,) * HORIZON

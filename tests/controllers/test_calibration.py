@@ -115,6 +115,17 @@ def test_another_arm_is_calibrated_as_well():
     assert done.row["outcome"] == "settled"
 
 
+def test_after_a_move_of_the_camera_frames_of_before_count_no_more():
+    mismatch = "moderate+camera_move=90deg"
+    settled = []
+    for settings in ({}, REGRESSING):
+        row = carry_out(run(mismatch, 88733, settings=settings, task="random")).row
+        settled.append(row["settling_time_s"])
+    calibrated, regressed = settled
+    # With the frames of before it settled 1.3 s behind the regression, which forgets as well.
+    assert calibrated < regressed + 0.1
+
+
 def test_an_arm_of_unknown_geometry_is_refused_with_the_reason():
     method = METHODS[METHOD]
     config = method.config()
