@@ -4,7 +4,11 @@
 
 with the features h of a serial arm (`FeatureModel`: tool, gears, zeros, links, pose of the camera), the latency L of a
 frame, the rate ω at which the camera turns about its optical axis, and the deviation s of the frames' unknown lateness,
-which moves a feature along its motion. An ensemble of Levenberg-Marquardt fits, which begin at different arms,
+which moves a feature along its motion. The joints are behind gears with a ripple a and a play of ±b,
+
+    q + a sin(k q) + b x,        x ← max(−1, min(x − Δq/b, 1)),
+
+where x says how far a joint is across its play. An ensemble of Levenberg-Marquardt fits, which begin at different arms,
 minimises
 
     Σ_k c ln(1 + ‖r_k‖²/c) + Σ_i 2 ln(1 + (θ_i/a_i)²) + 3 − tr(R₀ᵀR) + (L − L₀)²/2σ_L² + ω²/2σ_ω²
@@ -12,8 +16,8 @@ minimises
 over whitened residuals r_k, with Student's loss for outliers and Cauchy priors, of which small deviations shrink and
 large ones cost little. Members count by exp(−cost/2).
 
-Each step makes one iteration, so that the work of a step does not depend on a clock. Frames are kept in a buffer of
-`FRAMES`: the last ones, and of older ones a set that is thinned evenly.
+Each step makes one iteration, so that the work of a step does not depend on a clock. Frames are kept in a buffer: the
+last ones, and of older ones a set that is thinned evenly.
 """
 
 from __future__ import annotations
@@ -25,13 +29,14 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.features import FeatureModel
+from servobench.plant.contract.features import Derivatives, FeatureModel
 from servobench.plant.contract.lanes import branch, pick, plus_diagonal, where
 from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
 
-FRAMES: Final = 96  # frames in the buffer
+FRAMES: Final = 160  # rows of the buffer
+KEPT: Final = 96  # frames that are kept; late ones tell less each, so that more of them are
 RECENT: Final = 36  # the last of them, which are not thinned
 LONGEST: Final = 0.55  # [s] longest latency that is considered
 GRID: Final = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
@@ -43,9 +48,21 @@ SPREADS: Final = {
     "target": (0.01, 0.05, 0.15, 0.2),  # [m]
     "link": (0.03, 0.05, 0.15, 0.3),  # [1]
 }
-CORES: Final = {"zero": 0.08, "gear": 0.02, "tool": 0.02, "target": 0.02, "link": 0.04}
+GEARS: Final = ("play", "ripple")  # b and a [rad], the last entries of θ
+CORES: Final = {
+    "zero": 0.08,
+    "gear": 0.02,
+    "tool": 0.02,
+    "target": 0.02,
+    "link": 0.04,
+    "play": 0.0003,
+    "ripple": 0.0003,
+}
 """a_i, cores of the Cauchy priors, in the same units."""
-LARGEST: Final = {"gear": 0.7, "link": 0.8}  # [1] largest deviations of a member
+# [1], [rad] largest deviations of a member
+LARGEST: Final = {"gear": 0.7, "link": 0.8, "play": 0.1, "ripple": 0.1}
+RIPPLE_ORDER: Final = 8.0  # k [1], periods of the ripple in a turn
+MIN_PLAY: Final = 0.002  # [rad] within which joints cross it at least
 LATENCY: Final = (0.1, 0.3)  # [s] L₀ and σ_L
 # [s] between which it lies. Encoders may be late themselves, by a little: with more, a camera that turns and a frame
 # that is early look alike on a steady circle.
@@ -69,20 +86,30 @@ class Frames(NamedTuple):
     time: FloatArray  # (..., F) [s] since the start
     feature: FloatArray  # (..., F, m), in natural units
     weight: FloatArray  # (..., F, m), 1 for a valid feature, 0 for none
-    path: FloatArray  # (..., F, J, n) [rad], joint positions up to the frame, `GRID` apart, the newest last
+    # (..., F, J, 2n): joint positions [rad] up to the frame and x, `GRID` apart, the newest last
+    path: FloatArray
     number: IntArray  # (...), how many there are
 
 
 class Members(NamedTuple):
     """The ensemble of fits; E members."""
 
-    theta: FloatArray  # θ, (..., E, P)
+    theta: FloatArray  # θ, the model's and `GEARS`, (..., E, P)
     centre: FloatArray  # θ about which the priors are, (..., E, P): 0, and what was known when a camera was moved
     cameras: FloatArray  # (..., E, c, 4, 4)
     latency: FloatArray  # L, (..., E) [s]
     turning: FloatArray  # ω, (..., E) [rad/s]
     damping: FloatArray  # λ of Levenberg and Marquardt, (..., E)
     cost: FloatArray  # (..., E)
+
+
+class Geared(NamedTuple):
+    """Joints behind their gears, (..., n) each."""
+
+    joints: FloatArray  # [rad]
+    slope: FloatArray  # their derivatives by the reported ones without play
+    wave: FloatArray  # and by a
+    across: FloatArray  # and by b: x
 
 
 class Fitted(NamedTuple):
@@ -97,12 +124,12 @@ def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatA
     """Return joint positions and velocities a delay before each frame, by Catmull-Rom splines.
 
     Args:
-        path: (..., F, J, n) [rad].
+        path: (..., F, J, k) [rad].
         delay: (..., E) [s].
         grid: [s] between rows.
 
     Returns:
-        (..., E, F, n) [rad], and [rad/s].
+        (..., E, F, k) [rad], and [rad/s].
     """
     last = path.shape[-2] - 1
     x = np.clip(last - delay / grid, 0.0, last)
@@ -134,11 +161,11 @@ def each_row(frames: Frames, function: Callable[[FloatArray], FloatArray]) -> Fr
 
 
 def _thinned(frames: Frames) -> Frames:
-    """Return a full buffer without the old frame whose neighbours are nearest to each other in time."""
-    old = frames.time[..., : FRAMES - RECENT]
-    gaps = old[..., 2:] - old[..., :-2]
-    dropped = 1 + gaps.argmin(axis=-1)
+    """Return the buffer without the old frame whose neighbours are nearest to each other in time."""
     rows = np.arange(FRAMES)
+    gaps = frames.time[..., 2:] - frames.time[..., :-2]
+    old = rows[2:] < frames.number[..., None] - RECENT
+    dropped = 1 + np.where(old, gaps, np.inf).argmin(axis=-1)
     behind = rows >= dropped[..., None]
     kept = np.minimum(rows + behind, FRAMES - 1)
     thinned = each_row(frames, lambda array: pick(array, kept, axes=1))
@@ -146,10 +173,15 @@ def _thinned(frames: Frames) -> Frames:
 
 
 def added(
-    frames: Frames, time: FloatArray, feature: FloatArray, valid: BoolArray, path: FloatArray
+    frames: Frames,
+    most: IntArray,
+    time: FloatArray,
+    feature: FloatArray,
+    valid: BoolArray,
+    path: FloatArray,
 ) -> Frames:
-    """Return the buffer with one more frame, given `path` (..., J, n)."""
-    frames = branch(frames.number == FRAMES, _thinned, frames)
+    """Return the buffer with one more frame, given `path` (..., J, 2n), and one less from `most` (...) on."""
+    frames = branch(frames.number >= most, _thinned, frames)
     here = np.arange(FRAMES) == frames.number[..., None]
     new = {"time": time, "feature": feature, "weight": valid.astype(np.float64), "path": path}
     rows: dict[str, Any] = {}
@@ -216,6 +248,12 @@ def _whitened(
     return new, rates - slopes[..., None, :] * directions
 
 
+def _along(by_joint: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return Σ_j ∂h/∂q_j v_j, (..., E, m, F), of derivatives (..., E, n, m, F) and motions (..., E, F, n)."""
+    motion = np.swapaxes(motion, -1, -2)[..., None, :]
+    return np.asarray(np.add.reduce(by_joint * motion, axis=-3))
+
+
 def without_rates(fitted: Fitted) -> Fitted:
     """Return residuals alone."""
     return fitted._replace(rates=fitted.rates[..., :0, :, :])
@@ -237,7 +275,8 @@ class Fit:
         self.stride = max(1, round(GRID / period))
         self.grid = self.stride * period
         self.rows = 1 + int(np.ceil(LONGEST / self.grid))
-        names = model.names
+        self._own = len(model.names)  # entries of θ that are the model's
+        names = (*model.names, *GEARS)
         self.count = len(names)
         self._cores = np.full(len(names), np.inf)
         self._largest = np.full(len(names), np.inf)
@@ -248,10 +287,11 @@ class Fit:
             self._largest[index] = LARGEST.get(kind, np.inf)
             self._spreads[:, index] = SPREADS.get(kind, (0.0,) * 4)
         self._turns = [index for index, name in enumerate(names) if "turn_" in name]
-        places = range(model.pose_columns.start, len(names))
+        places = range(model.pose_columns.start, self._own)
         self._places = [index for index in places if index not in self._turns]
         self._zeros = model.columns("zero_")
         self.first_turn = names.index("camera_turn_z")
+        self._least = np.where([name == "play" for name in names], 0.0, -self._largest)
         # Where members begin, in shares of their spreads; the same in every run.
         generator = np.random.default_rng(12345)
         self._draws = generator.uniform(-1.0, 1.0, (256, len(names)))
@@ -286,37 +326,76 @@ class Fit:
 
     def aligned(self, members: Members, frames: Frames) -> Members:
         """Return members whose cameras are placed where their arms fit the frames best, where that has a solution."""
-        q, _ = at_latency(frames.path, members.latency, self.grid)
+        q, _ = self.exposed(members, frames.path)
         weight = np.minimum.reduce(frames.weight, axis=-1)[..., None, :]
         features = self.scale * frames.feature[..., None, :, :]
-        cameras = self.model.placed(members.theta, members.cameras, q, features, weight)
+        theta = members.theta[..., : self._own]
+        cameras = self.model.placed(theta, members.cameras, q.joints, features, weight)
         return members._replace(cameras=cameras)
+
+    def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
+        """Return joints behind gears at the exposures of frames with paths (..., F, J, 2n), and their velocities."""
+        across, rate = at_latency(path, members.latency, self.grid)
+        q = self.geared(members, across)
+        velocity, crossing = np.split(rate, 2, axis=-1)
+        play = members.theta[..., self._own, None, None]
+        return q, q.slope * velocity + play * crossing
+
+    def geared(self, members: Members, across: FloatArray) -> Geared:
+        """Return joints behind gears for reported ones and x, (..., E, F, 2n)."""
+        q, x = np.split(across, 2, axis=-1)
+        play, ripple = np.moveaxis(members.theta[..., self._own :, None, None], -3, 0)
+        phase = RIPPLE_ORDER * q
+        wave = np.sin(phase)
+        slope = 1.0 + ripple * RIPPLE_ORDER * np.cos(phase)
+        return Geared(q + ripple * wave + play * x, slope, wave, x)
+
+    def crossed(
+        self, members: Members, share: FloatArray, across: FloatArray, q: FloatArray
+    ) -> FloatArray:
+        """Return reported joints that moved to `q` (..., n) [rad] and x there, given both before, (..., 2n)."""
+        before, x = np.split(across, 2, axis=-1)
+        play = np.vecdot(share, members.theta[..., self._own])
+        size = np.maximum(play, MIN_PLAY)[..., None]
+        after = np.clip(x - (q - before) / size, -1.0, 1.0)
+        return np.concatenate([q, after], axis=-1)
+
+    def feature(self, members: Members, q: Geared, turn: FloatArray) -> FloatArray:
+        """Return the features of members, (..., E, F, m), in the unit of the model, the cameras turned by `turn`."""
+        theta = members.theta[..., : self._own]
+        return self.model.feature(theta, members.cameras, q.joints, turn)
+
+    def derivatives(self, members: Members, q: Geared, turn: FloatArray) -> Derivatives:
+        """Return the same with derivatives, by joints behind the gears."""
+        theta = members.theta[..., : self._own]
+        return self.model.derivatives(theta, members.cameras, q.joints, turn)
 
     def fitted(self, members: Members, frames: Frames) -> Fitted:
         """Return the residuals of members at the frames, with derivatives."""
-        q, v = at_latency(frames.path, members.latency, self.grid)
+        q, v = self.exposed(members, frames.path)
         since = frames.time[..., None, :]
         turn = members.turning[..., None] * since
-        found = self.model.derivatives(members.theta, members.cameras, q, turn)
+        found = self.derivatives(members, q, turn)
         weight = np.swapaxes(frames.weight, -1, -2)[..., None, :, :]
         # In the unit of the frames' features; 0 for those that are not valid.
         size = weight / self.scale
-        by_joint = np.swapaxes(found.by_joint, -1, -3)
-        velocity = np.swapaxes(v, -1, -2)[..., None, :]
-        motion = size * np.add.reduce(by_joint * velocity, axis=-3)
+        by_joint = size[..., None, :, :] * np.swapaxes(found.by_joint, -1, -3)
+        motion = _along(by_joint, v)
         by_parameter = np.swapaxes(found.by_parameter, -1, -3)
         shape = by_parameter.shape
         rates = np.empty((*shape[:-3], self.count + 2, *shape[-2:]))
-        np.multiply(by_parameter, size[..., None, :, :], out=rates[..., :-2, :, :])
+        np.multiply(by_parameter, size[..., None, :, :], out=rates[..., : self._own, :, :])
+        rates[..., self._own, :, :] = _along(by_joint, q.across)
+        rates[..., self._own + 1, :, :] = _along(by_joint, q.wave)
         rates[..., -2, :, :] = -motion
         rates[..., -1, :, :] = rates[..., self.first_turn, :, :] * since[..., None, :]
         return Fitted(self._missed(frames, found.feature), rates, motion)
 
     def residual(self, members: Members, frames: Frames) -> FloatArray:
         """Return y − h of members at the frames, (..., E, m, F)."""
-        q, _ = at_latency(frames.path, members.latency, self.grid)
+        q, _ = self.exposed(members, frames.path)
         turn = members.turning[..., None] * frames.time[..., None, :]
-        return self._missed(frames, self.model.feature(members.theta, members.cameras, q, turn))
+        return self._missed(frames, self.feature(members, q, turn))
 
     def _missed(self, frames: Frames, seen: FloatArray) -> FloatArray:
         """Return residuals, (..., E, m, F), where features (..., E, F, m) of the model are seen."""
@@ -409,7 +488,7 @@ class Fit:
         A = plus_diagonal(H, damped)
         step = np.linalg.solve(A, g[..., None])[..., 0]
         step = step * self._shrink(step)[..., None]
-        tried = self._moved(members, step)
+        tried = self.moved(members, step)
         found = self.residual(tried, frames)
         tried_cost, _ = self.costs(tried, fitted._replace(residual=found), lateness, variance)
         better = tried_cost < cost
@@ -426,14 +505,19 @@ class Fit:
         largest = np.maximum.reduce(zeros, axis=-1)
         return np.asarray(np.minimum(1.0, MAX_ZERO_STEP / np.maximum(largest, 1e-9)))
 
-    def _moved(self, members: Members, step: FloatArray) -> Members:
+    def moved(self, members: Members, step: FloatArray) -> Members:
         """Return members after a step (..., E, P + 2), within bounds."""
         own = step[..., : self.count]
         later, turning = np.moveaxis(step[..., self.count :], -1, 0)
-        theta, cameras = self.model.moved(members.theta, members.cameras, own)
+        model = slice(self._own)
+        moved, cameras = self.model.moved(
+            members.theta[..., model], members.cameras, own[..., model]
+        )
+        gears = members.theta[..., self._own :] + own[..., self._own :]
+        theta = np.concatenate([moved, gears], axis=-1)
         latency = members.latency + later
         return members._replace(
-            theta=np.clip(theta, -self._largest, self._largest),
+            theta=np.clip(theta, self._least, self._largest),
             cameras=cameras,
             latency=np.clip(latency, *LATENCIES),
             turning=members.turning + turning,

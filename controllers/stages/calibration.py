@@ -18,6 +18,8 @@ from servobench.controllers.stages.arm_fit import (
     FIRST_DAMPING,
     FLOOR,
     FRAMES,
+    GEARS,
+    KEPT,
     Fit,
     Fitted,
     Frames,
@@ -105,7 +107,8 @@ class CalibrationState(NamedTuple):
 
     begin: float  # [s] time of the first observation
     elapsed: float  # [s] from it to the last one
-    history: FloatArray  # joint positions of the last periods, the newest first, (..., h, n)
+    # Joint positions of the last periods and how far they are across their play, the newest first, (..., h, 2n)
+    history: FloatArray
     frames: Frames
     members: Members
     share: FloatArray  # weight of each member, (..., E)
@@ -141,6 +144,7 @@ class Calibration:
         """Take knowledge in natural units, and the model in the unit of the plant."""
         self._period = knowledge.spec.period
         self._m = knowledge.spec.m
+        self._n = knowledge.spec.n
         self.fit = Fit(model, knowledge.unit, self._period)
         self._periods = 1 + (self.fit.rows - 1) * self.fit.stride
 
@@ -150,24 +154,24 @@ class Calibration:
         q = observation.joint_position
         fit = self.fit
         m = self._m
-        n = q.shape[-1]
         none = np.zeros(lead)[()]
         no = np.zeros(lead, dtype=np.bool_)[()]
         zero = np.zeros(lead, dtype=np.int_)[()]
         rows = (*lead, FRAMES)
         features = np.zeros((*rows, m))
-        paths = np.zeros((*rows, fit.rows, n))
+        across = np.concatenate([q, np.zeros_like(q)], axis=-1)
+        paths = np.zeros((*rows, fit.rows, across.shape[-1]))
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
         members = fit.start(lead, FIRST_MEMBERS, none)
         size = (*lead, FIRST_MEMBERS)
         periods = self._periods
         if np.isfinite(observation.capture_time).any():
             periods += whole_periods(MAX_LATENESS, self._period)
-        history = np.broadcast_to(q[..., None, :], (*lead, periods, n))
+        history = np.repeat(across[..., None, :], periods, axis=-2)
         return CalibrationState(
             begin=float(observation.time),
             elapsed=0.0,
-            history=history.copy(),
+            history=history,
             frames=frames,
             members=members,
             share=np.full(size, 1.0 / FIRST_MEMBERS),
@@ -208,10 +212,11 @@ class Calibration:
             regression: at this observation.
             late: by which the frame is known to be later than others, (...) [s]; None where nothing is known.
         """
-        q = observation.joint_position
-        step = q - state.history[..., 0, :]
+        before = state.history[..., 0, :]
+        across = self.fit.crossed(state.members, state.share, before, observation.joint_position)
+        step = self._joints(across - before)
         earlier = state.history[..., :-1, :]
-        history = np.concatenate([q[..., None, :], earlier], axis=-2)
+        history = np.concatenate([across[..., None, :], earlier], axis=-2)
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
         state = state._replace(history=history, travel=travel, elapsed=elapsed)
@@ -242,7 +247,8 @@ class Calibration:
             # Time and path are those at which it would have come if it were not late.
             instant = time - late
         y = observation.feature
-        frames = added(state.frames, instant, y, observation.valid, path)
+        most = np.where(state.lateness > 0.0, FRAMES, KEPT)
+        frames = added(state.frames, most, instant, y, observation.valid, path)
         noise = np.clip(regression.deviation, *NOISE)
         known = (state.lateness > 0.0) & (state.across > 0.0)
         across = np.minimum(np.maximum(state.across, NOISE[0]), noise)
@@ -287,8 +293,12 @@ class Calibration:
             ),
         )
 
+    def _joints(self, across: FloatArray) -> FloatArray:
+        """Return joint positions alone, (..., n), of rows (..., 2n) of the history."""
+        return across[..., : self._n]
+
     def _path(self, history: FloatArray, late: FloatArray | None) -> FloatArray:
-        """Return joint positions up to `late` (...) [s] ago, (..., J, n), the newest last."""
+        """Return rows of the history up to `late` (...) [s] ago, (..., J, 2n), the newest last."""
         stride = self.fit.stride
         if late is None:
             return history[..., : self._periods : stride, :][..., ::-1, :]
@@ -426,13 +436,12 @@ class Calibration:
         known = past[0]
         fit = self.fit
         members = known.members
-        q, _ = at_latency(path[..., None, :, :], members.latency, fit.grid)
+        q, _ = fit.exposed(members, path[..., None, :, :])
         turn = (members.turning * instant[..., None])[..., None]
-        found = fit.model.feature(members.theta, members.cameras, q, turn)
+        found = fit.feature(members, q, turn)
         seen = found[..., 0, :] / fit.scale
         by_arm = np.vecmat(known.share, seen + known.bias)
-        exposed, _ = at_latency(path[..., None, :, :], delay[..., None], fit.grid)
-        moved = np.matvec(known.jacobian, exposed[..., 0, 0, :] - known.exposed)
+        moved = np.matvec(known.jacobian, self._exposed(path, delay) - known.exposed)
         by_regression = known.feature + moved
         errors = np.stack([y - by_regression, y - by_arm], axis=-2)
         most = np.square(MAX_ERROR * state.noise)[..., None]
@@ -440,11 +449,17 @@ class Calibration:
         mean = MEMORY * state.errors + (1.0 - MEMORY) * squares
         mean = np.where(np.isnan(state.errors), squares, mean)
         comparable = known.fitted & (known.moves == state.moves)
-        ways = np.matvec(known.jacobian[..., None, :, :], np.diff(path, axis=-2))
+        steps = self._joints(np.diff(path, axis=-2))
+        ways = np.matvec(known.jacobian[..., None, :, :], steps)
         way = np.add.reduce(norm(ways), axis=-1)
         far = norm(errors[..., 1, :]) > BROKEN * state.noise + way
         new = state._replace(errors=np.where(comparable[..., None], mean, state.errors))
         return new, np.asarray(known.fitted & far)
+
+    def _exposed(self, path: FloatArray, delay: FloatArray) -> FloatArray:
+        """Return joint positions, (..., n) [rad], a delay (...) [s] before the end of a path (..., J, 2n)."""
+        exposed, _ = at_latency(path[..., None, :, :], delay[..., None], self.fit.grid)
+        return self._joints(exposed[..., 0, 0, :])
 
     def _trusted(self, state: CalibrationState) -> BoolArray:
         gate = GATE * np.where(state.used, HYSTERESIS[1], HYSTERESIS[0])
@@ -510,15 +525,13 @@ class Calibration:
         if same_size and not np.any(due):
             return past
         path = self._path(state.history, None)
-        delay = regression.delay[..., None]
-        exposed, _ = at_latency(path[..., None, :, :], delay, self.fit.grid)
         new = Known(
             state.members,
             state.share,
             state.bias,
             regression.feature,
             regression.jacobian,
-            exposed[..., 0, 0, :],
+            self._exposed(path, regression.delay),
             state.fitted,
             regression.moves,
         )
@@ -533,25 +546,24 @@ class Calibration:
 
     def jacobian(self, state: CalibrationState) -> FloatArray:
         """Return the Jacobian at the joint position of the last observation, (..., m, n)."""
-        q = state.history[..., 0, :]
+        q = self._joints(state.history[..., 0, :])
         return self.ahead(state, q, np.zeros(q.shape[:-1])).jacobian
 
     def ahead(self, state: CalibrationState, bound: FloatArray, lead: FloatArray) -> Ahead:
         """Return the prediction for joints that are bound to reach `bound` (..., n) after `lead` (...) periods."""
         fit = self.fit
         members = state.members
-        size = state.share.shape[-1]
-        q = np.broadcast_to(
-            bound[..., None, None, :], (*bound.shape[:-1], size, 1, bound.shape[-1])
-        )
+        across = fit.crossed(members, state.share, state.history[..., 0, :], bound)
+        q = fit.geared(members, across[..., None, None, :])
         ahead = lead[..., None] * self._period
         since = state.elapsed + ahead + members.latency
         turn = (members.turning * since)[..., None]
-        found = fit.model.derivatives(members.theta, members.cameras, q, turn)
+        found = fit.derivatives(members, q, turn)
         feature = found.feature[..., 0, :] / fit.scale
         by_turn = found.by_parameter[..., 0, :, fit.first_turn] / fit.scale
         drift = by_turn * (members.turning * self._period)[..., None]
-        jacobian = found.by_joint[..., 0, :, :] / fit.scale
+        by_joint = found.by_joint * q.slope[..., None, :]
+        jacobian = by_joint[..., 0, :, :] / fit.scale
         flat = jacobian.reshape(*jacobian.shape[:-2], -1)
         mean = np.vecmat(state.share, flat)
         shape = (*bound.shape[:-1], *jacobian.shape[-2:])
@@ -566,12 +578,15 @@ class Calibration:
         members = state.members
         latency = np.vecdot(state.share, members.latency)
         turning = np.vecdot(state.share, members.turning)
+        gears = np.vecmat(state.share, members.theta)[..., -len(GEARS) :]
         errors = np.sqrt(state.errors)
         return {
             "calibrated": np.asarray(state.used, dtype=np.float64),
             "calibration_rms": state.rms,
             "calibration_latency": latency,
             "calibration_turning": turning,
+            "calibration_play": gears[..., 0],
+            "calibration_ripple": gears[..., 1],
             "lateness": state.lateness,
             "regression_error": errors[..., 0],
             "arm_error": errors[..., 1],

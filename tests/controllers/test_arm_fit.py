@@ -5,6 +5,7 @@ import pytest
 
 from servobench.controllers.stages.arm_fit import (
     FRAMES,
+    KEPT,
     RECENT,
     Fit,
     Fitted,
@@ -15,11 +16,15 @@ from servobench.controllers.stages.arm_fit import (
     whitened,
 )
 from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.parametric import ParametricModel
 
 PERIOD = 0.05  # [s]
+FINE = 0.01  # [s] at which the gears of made-up runs move
 LATENCY = 0.08  # [s] of the made-up runs
 NOISE = 1e-3  # [m]
+PLAY, RIPPLE = -2, -1  # places in θ
+NO_PLAY = MechanicsConfig()
 TRUE = {"gear_elbow": 0.2, "zero_shoulder_pan": 0.4, "zero_wrist_1": -0.2, "tool_x": 0.02}
 
 
@@ -40,13 +45,35 @@ def empty(fit, m=3, n=6):
         time=np.zeros(FRAMES),
         feature=np.zeros((FRAMES, m)),
         weight=np.zeros((FRAMES, m)),
-        path=np.zeros((FRAMES, fit.rows, n)),
+        path=np.zeros((FRAMES, fit.rows, 2 * n)),
         number=np.int_(0),
     )
 
 
-def made_up(fit, seconds=4.0, deviations=TRUE):
-    """Return frames of an arm with deviations, and its θ and cameras."""
+def driven(mechanics, times):
+    """Return where the plant's joints behind gears are at times, (..., 6)."""
+    x = joints_at(times[0])
+    rows = []
+    for time in times:
+        x = mechanics.driven(x, joints_at(time))
+        rows.append(x)
+    return np.array(rows)
+
+
+def crossed(fit, time, size):
+    """Return joints and how far they are across a play of ±`size` at times, (..., 12), the oldest of which is first."""
+    members = fit.start((), 1, np.float64(0.0))
+    members.theta[:, PLAY] = size
+    row = np.concatenate([joints_at(time[0]), np.zeros(6)])
+    rows = []
+    for each in time:
+        row = fit.crossed(members, np.ones(1), row, joints_at(each))
+        rows.append(row)
+    return np.array(rows)
+
+
+def made_up(fit, seconds=4.0, deviations=TRUE, mechanics=NO_PLAY):
+    """Return frames of an arm with deviations and gears, and its θ and cameras."""
     generator = np.random.default_rng(1)
     model = fit.model
     step = np.zeros(len(model.names))
@@ -54,12 +81,18 @@ def made_up(fit, seconds=4.0, deviations=TRUE):
         step[[each.startswith(name) for each in model.names]] = value
     theta, cameras = model.moved(*model.start(()), step)
     frames = empty(fit)
-    back = fit.grid * np.arange(fit.rows)[::-1]
-    for time in np.arange(0.0, seconds, PERIOD):
-        exposed = joints_at(np.array([time - LATENCY]))
+    times = np.arange(-1.0, seconds, FINE)
+    behind = driven(mechanics, times)
+    across = crossed(fit, times, 0.5 * mechanics.backlash)
+    first = round(1.0 / FINE)
+    stride = round(PERIOD / FINE)
+    late = round(LATENCY / FINE)
+    for last in range(first, len(times), stride):
+        exposed = behind[last - late][None]
         y = model.feature(theta, cameras, exposed)[0] + NOISE * generator.standard_normal(3)
-        path = joints_at(time - back)
-        frames = added(frames, np.float64(time), y, np.ones(3, dtype=bool), path)
+        path = across[last - stride * (fit.rows - 1) : last + 1 : stride]
+        time = np.float64(times[last])
+        frames = added(frames, np.int_(FRAMES), time, y, np.ones(3, dtype=bool), path)
     return frames, theta, cameras
 
 
@@ -77,19 +110,23 @@ def test_joints_between_rows_are_those_of_a_smooth_motion():
     np.testing.assert_allclose(velocity[1:, 0], rates[1:], atol=0.02)
 
 
-def test_a_full_buffer_keeps_the_last_frames_and_thins_the_others_evenly():
+@pytest.mark.parametrize("most", [KEPT, FRAMES])
+def test_a_full_buffer_keeps_the_last_frames_and_thins_the_others_evenly(most):
     fit = fit_of_ur5()
     frames = empty(fit)
     count = 1000
     for k in range(count):
         feature = np.full(3, float(k))
-        frames = added(frames, np.float64(k), feature, np.ones(3, bool), np.zeros((fit.rows, 6)))
-    assert frames.number == FRAMES
-    np.testing.assert_array_equal(frames.time[-RECENT:], np.arange(count - RECENT, count))
+        path = np.zeros((fit.rows, 12))
+        frames = added(frames, np.int_(most), np.float64(k), feature, np.ones(3, bool), path)
+    assert frames.number == most
+    np.testing.assert_array_equal(
+        frames.time[most - RECENT : most], np.arange(count - RECENT, count)
+    )
     assert frames.time[0] == 0.0
-    gaps = np.diff(frames.time[: FRAMES - RECENT])
+    gaps = np.diff(frames.time[: most - RECENT])
     assert gaps.max() <= 3.0 * np.median(gaps)
-    np.testing.assert_array_equal(frames.feature[:, 0], frames.time)
+    np.testing.assert_array_equal(frames.feature[:most, 0], frames.time[:most])
 
 
 def test_whitening_makes_noise_along_the_motion_white():
@@ -133,3 +170,45 @@ def test_a_deviating_arm_is_found_again_at_all_places_and_so_is_the_latency():
     wrong = np.linalg.norm(found.by_joint - wanted.by_joint) / np.linalg.norm(wanted.by_joint)
     assert wrong < 0.03
     assert np.abs(found.feature - wanted.feature).max() < 0.02
+
+
+def test_derivatives_of_residuals_are_those_of_differences():
+    fit = fit_of_ur5()
+    frames, _, _ = made_up(fit, 1.0)
+    members = fit.spawned((), np.int_(1), 2, np.float64(0.06))
+    members.theta[:, PLAY] = 0.01
+    members.theta[:, RIPPLE] = 0.02
+    rates = fit.fitted(members, frames).rates
+    size = 1e-6
+
+    def moved(column, change):
+        step = np.zeros((2, fit.count + 2))
+        step[:, column] = change
+        return fit.residual(fit.moved(members, step), frames)
+
+    for column in range(fit.count + 2):
+        slope = (moved(column, size) - moved(column, -size)) / (2.0 * size)
+        scale = max(1e-3, np.abs(slope).max())
+        np.testing.assert_allclose(rates[:, column], -slope, atol=1e-4 * scale, err_msg=column)
+
+
+def test_play_and_ripple_of_the_plants_gears_are_found():
+    fit = fit_of_ur5()
+    frames, _, _ = made_up(fit, 6.0, mechanics=MechanicsConfig(backlash=0.015, ripple=0.02))
+    members = fit.aligned(fit.start((), 8, np.float64(0.1)), frames)
+    variance = np.full(8, NOISE**2)
+    for _ in range(60):
+        fitted = fit.fitted(members, frames)
+        members, _ = fit.iterated(members, frames, fitted, np.float64(0.0), variance)
+    best = members.theta[int(members.cost.argmin())]
+    assert best[RIPPLE] == pytest.approx(0.02, abs=2e-3)
+    assert best[PLAY] == pytest.approx(0.015, abs=3e-3)
+
+
+def test_how_far_joints_are_across_their_play_is_as_on_the_plant():
+    fit = fit_of_ur5()
+    size = 0.015
+    times = np.arange(0.0, 6.0, FINE)
+    behind = driven(MechanicsConfig(backlash=size), times)
+    wanted = (behind - joints_at(times)) / size
+    np.testing.assert_allclose(crossed(fit, times, size)[:, 6:], wanted, atol=1e-9)

@@ -109,6 +109,17 @@ def test_a_law_with_a_preview_of_its_own_knows_how_the_camera_turns():
     assert row["rms_error_evaluated"] < 1e-3
 
 
+def test_play_and_ripple_of_gears_are_found_and_reckoned_with():
+    geared = "moderate+backlash=1deg+ripple=0.03rad"
+    calibrated = carry_out(run(geared))
+    regressed = carry_out(run(geared, settings=REGRESSING))
+    error = "rms_error_evaluated"
+    assert calibrated.row[error] < 0.5 * regressed.row[error]
+    last = calibrated.steps.iloc[-1]
+    assert last["diagnostic_calibration_play"] == pytest.approx(np.radians(1.0), rel=0.2)
+    assert last["diagnostic_calibration_ripple"] == pytest.approx(0.03, rel=0.1)
+
+
 def test_another_arm_is_calibrated_as_well():
     brief = {"exp2": {"duration": 3.0}}
     done = carry_out(run("moderate", settings=brief, task="exp2", robot="panda"))
