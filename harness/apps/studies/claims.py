@@ -292,8 +292,9 @@ def _ratio_in_words(ratio: float) -> str:
 
 
 def _keeps_up(tables: Tables, plant: str) -> Answer:
-    online = _jacobian_errors(tables[MAIN])
+    """Compare errors on the robots that ran with frozen learning as well; rendered, these are fewer."""
     frozen = _jacobian_errors(tables[FROZEN])
+    online = _jacobian_errors(tables[MAIN]).reindex(frozen.index)
     both = pd.DataFrame({"online": online, "frozen": frozen})
     small = margin("jacobian_error_mean", tables[MAIN])
     measured, levels, words = [], [], []

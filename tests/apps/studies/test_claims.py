@@ -357,3 +357,11 @@ def test_the_command_answers_from_real_runs_and_says_the_same_again(
     assert "the same answers as in" in output_of(*again)
     wanted.write_text(wanted.read_text().replace("faster in", "faster by far in"))
     assert "claim 1 on kinematic, best equipped: now" in output_of(*again, code=1)
+
+
+def test_few_robots_with_frozen_learning_are_compared_with_the_same_robots_learning():
+    made = tables()
+    made[FROZEN] = made[FROZEN][made[FROZEN]["seed"] < 4]
+    found = {answer.claim: answer for answer in answer_all(made, "kinematic")}["7"]
+    # Robots of one table alone counted as lost.
+    assert "exp1 10.0 / 10.0 %" in found.evidence
