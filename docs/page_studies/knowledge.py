@@ -21,7 +21,7 @@ from servobench.harness.config.settings import flatten
 
 # A camera that turns; an arm that deviates; a ball that is hidden; frames that are late
 WORLDS: Final = ("turning_camera", "gears50", "hidden", "jitter")
-SEEDS: Final = "800298:800348"  # the first 50 robots of the study `learned`
+SEEDS: Final = "800298:800348"  # the first 50 of an earlier draw of the study `learned`
 REFERENCES: Final = "references"  # part whose references judge all others
 LADDER: Final = ("rbfnn_mfac", "ukf_mfac")
 # The predictive law brings a preview and limits itself; that of the paper gives its own preview up for the aid

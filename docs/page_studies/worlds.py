@@ -13,6 +13,7 @@ from page_studies import cells
 from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import (
+    Estimate,
     column_of,
     mean_with_interval,
     median_with_interval,
@@ -42,8 +43,8 @@ LEARNED_IN = (
     "all_at_once",
 )
 LEARNED_BY = ("regression_mfac", "ukf_mpc", "rbfnn_mfac", "calibrating_mfac", "revealed")
-# From the hash of the last commit that changed code before they were drawn: c362a
-LEARNED_SEEDS = "800298:800498"
+# From the hash of the last commit that changed code before they were drawn: 46a47
+LEARNED_SEEDS = "289351:289551"
 FRESH = "140428:140628"  # from the hash of the last commit that changed code before they were drawn
 _UKF = {"aids.model": "nominal", "estimator.walk": "1e-12", "estimator.initial_deviation": "1e-12"}
 # Settings without which a method keeps the Jacobian of the nominal model
@@ -168,11 +169,21 @@ def shares_table(scores: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def middle(row: pd.Series[float]) -> str:
+    """Return the median of the measure of a method in a challenge, with its interval; a dash where it is infinite."""
+    value, low, high = (row[f"median.{part}"] for part in ("value", "low", "high"))
+    return cells.short(Estimate(value, low, high, int(row["median.count"])), 2)
+
+
 def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the scores of what is known or learned in eight worlds, a row a world, and shares of their variance."""
+    """Return the scores of what is known or learned in eight worlds, a row a world, and shares of their variance.
+
+    Beside the scores, which end at 1, stand the medians of times and errors, which tell who is better than that.
+    """
     scores = pd.read_csv(folder / "runs" / "scores.csv").dropna(subset=["score"])
     methods = pd.read_csv(folder / "runs" / "methods.csv")
     rows = []
+    medians = []
     for name, runs in methods.groupby("challenge", sort=False):
         own = runs.set_index("controller")
         by_method = dict(iter(scores[scores["challenge"] == name].groupby("controller")["score"]))
@@ -187,7 +198,13 @@ def learned_table(folder: Path) -> dict[str, pd.DataFrame]:
         row = {"world": f"`{name}`", "best as published": scored(own.loc[best])}
         row |= {cells.quoted(method): shown[method] for method in LEARNED_BY}
         rows.append(row | {"score 1 is": f"{own['reference'].iloc[0]:.2f} {unit}"})
-    return {"learned": pd.DataFrame(rows), "learned_shares": shares_table(scores)}
+        each = {cells.quoted(method): middle(own.loc[method]) for method in own.index}
+        medians.append({"world": f"`{name}`", "unit": unit} | each)
+    return {
+        "learned": pd.DataFrame(rows),
+        "learned_shares": shares_table(scores),
+        "learned_medians": pd.DataFrame(medians),
+    }
 
 
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:

@@ -138,7 +138,7 @@ def test_the_table_of_controllers_has_their_parts_and_aids():
 def short_runs():
     """A short run of each estimator, each law, the aids, and what is no pair."""
     pairs = [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS]
-    controllers = [*pairs, "regression_mfac", "nmpc_calibrated"]
+    controllers = [*pairs, "calibrating_mfac", "nmpc_calibrated"]
     chosen = ["exp2.duration=0.2", "run.full_jacobian=true", "kinematic.sensing.stamps=true"]
     settings = read_settings(None, chosen)
     return [
