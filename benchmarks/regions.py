@@ -7,20 +7,21 @@ positions that are spread evenly over the working region; the arm does not move 
 robots of ‖Ĵ − J‖/‖J‖ (Frobenius, over all positions), and how far the arm's features are from the true ones.
 """
 
-from collections.abc import Iterable, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.stats import qmc
 
 from measuring import options, table
-from servobench.controllers.servo import ServoController
 from servobench.harness.apps.studies.challenge import find_challenge
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import Experiment, build
+from servobench.harness.run.experiment import build
 from servobench.harness.run.loop import begin, careful, periods
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_seed
 
 METHOD: Final = "calibrating_mfac"
 CHALLENGES: Final = ("gears50", "zeros90", "zeros180_tour", "unknown_arm_tour")
@@ -37,50 +38,42 @@ class Errors(NamedTuple):
     believed: bool  # whether the method uses the arm
 
 
-def positions(controller: ServoController) -> FloatArray:
-    """Return joint positions (k, n) [rad] all over the working region."""
-    knowledge = controller.servo.knowledge
-    assert knowledge.region is not None
-    lower, upper = knowledge.region
-    evenly = qmc.Sobol(len(lower), seed=1).random(POSITIONS)
-    return np.asarray(qmc.scale(evenly, lower, upper))
+def evenly(region: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Return joint positions (k, n) [rad] all over a box of joint positions."""
+    lower, upper = region
+    shares = qmc.Sobol(len(lower), seed=1).random(POSITIONS)
+    return np.asarray(qmc.scale(shares, lower, upper))
 
 
-def errors(experiment: Experiment, seed: int) -> Iterator[Errors]:
-    """Yield what is wrong at each instant of a run."""
+def errors(request: RunRequest) -> list[Errors]:
+    """Return what is wrong at each instant of a run."""
+    experiment = build(resolve(request, Settings()))
+    plant = experiment.plant
     controller = experiment.controller
-    assert isinstance(controller, ServoController)
-    rollout = begin(
-        experiment.plant, controller, experiment.desired(), experiment.loop, (seed, seed)
-    )
-    left = list(INSTANTS)
+    seeds = named_seed(request.seed, "plant"), named_seed(request.seed, "controller")
+    rollout = begin(plant, controller, experiment.desired(), experiment.loop, seeds)
+    found: list[Errors] = []
     with careful():
         for period in periods(rollout, controller):
-            if left and period.observation.time >= left[0] - 1e-9:
-                left.pop(0)
-                yield _wrong(controller, experiment)
-            if not left:
-                return
+            if period.observation.time >= INSTANTS[len(found)] - 1e-9:
+                found.append(_wrong(controller, experiment.drawn.true))
+            if len(found) == len(INSTANTS):
+                break
+    return found
 
 
-def _wrong(controller: ServoController, experiment: Experiment) -> Errors:
+def _wrong(controller: Any, true: Any) -> Errors:  # noqa: ANN401 - a `ServoController`, and the true robot
     servo = controller.servo
     state = controller.state
-    calibration = servo.calibration
-    true = experiment.drawn.true
-    assert state is not None
-    assert state.calibration is not None
-    assert calibration is not None
-    assert true is not None
     scale = servo.knowledge.unit
     wanted: list[FloatArray] = []
     regressed: list[FloatArray] = []
     calibrated: list[FloatArray] = []
     places: list[FloatArray] = []
-    for q in positions(controller):
+    for q in evenly(servo.knowledge.region):
         wanted.append(true.jacobian(q))
         regressed.append(scale * servo.estimation.ahead(state.estimation, q)[0])
-        ahead = calibration.ahead(state.calibration, q, np.zeros(()))
+        ahead = servo.calibration.ahead(state.calibration, q, np.zeros(()))
         calibrated.append(scale * ahead.jacobian)
         places.append(scale * ahead.feature - true.feature(q))
     size = np.linalg.norm(wanted)
@@ -105,8 +98,7 @@ def main() -> None:
     rows = []
     for name in CHALLENGES:
         cells = find_challenge(name).cells(("kinematic",), (METHOD,), seeds)
-        runs = [cell.request for cell in cells if cell.request.controller == METHOD]
-        found = [list(errors(build(resolve(run, Settings())), run.seed)) for run in runs]
+        found = [errors(cell.request) for cell in cells if cell.request.controller == METHOD]
         for instant, each in zip(INSTANTS, zip(*found, strict=True), strict=True):
             row = [
                 shown((one.regression for one in each), 100.0, 1),

@@ -8,8 +8,8 @@ which moves a feature along its motion. The joints are behind gears with a rippl
 
     q + a sin(k q) + b x,        x ← max(−1, min(x − Δq/b, 1)),
 
-where x says how far a joint is across its play. An ensemble of Levenberg-Marquardt fits, which begin at different arms,
-minimises
+with the place x of a joint within its play, from −1 to 1. An ensemble of Levenberg-Marquardt fits, which begin at
+different arms, minimises
 
     Σ_k c ln(1 + ‖r_k‖²/c) + Σ_i 2 ln(1 + (θ_i/a_i)²) + 3 − tr(R₀ᵀR) + (L − L₀)²/2σ_L² + ω²/2σ_ω²
 
@@ -36,7 +36,7 @@ from servobench.plant.contract.signals import BoolArray
 IntArray: TypeAlias = npt.NDArray[np.int_]
 
 FRAMES: Final = 160  # rows of the buffer
-KEPT: Final = 96  # frames that are kept; late ones tell less each, so that more of them are
+KEPT: Final = 96  # frames that are kept; all rows are used where frames are late, as each of them tells less then
 RECENT: Final = 36  # the last of them, which are not thinned
 LONGEST: Final = 0.55  # [s] longest latency that is considered
 GRID: Final = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
@@ -62,7 +62,7 @@ CORES: Final = {
 # [1], [rad] largest deviations of a member
 LARGEST: Final = {"gear": 0.7, "link": 0.8, "play": 0.1, "ripple": 0.1}
 RIPPLE_ORDER: Final = 8.0  # k [1], periods of the ripple in a turn
-MIN_PLAY: Final = 0.002  # [rad] within which joints cross it at least
+ASSUMED_PLAY: Final = 0.002  # [rad] b by which x moves while less is fitted
 LATENCY: Final = (0.1, 0.3)  # [s] L₀ and σ_L
 # [s] between which it lies. Encoders may be late themselves, by a little: with more, a camera that turns and a frame
 # that is early look alike on a steady circle.
@@ -107,9 +107,9 @@ class Geared(NamedTuple):
     """Joints behind their gears, (..., n) each."""
 
     joints: FloatArray  # [rad]
-    slope: FloatArray  # their derivatives by the reported ones without play
-    wave: FloatArray  # and by a
-    across: FloatArray  # and by b: x
+    slope: FloatArray  # their derivatives by the reported ones, outside of the play
+    wave: FloatArray  # their derivatives by a, sin(k q)
+    place: FloatArray  # their derivatives by b, x
 
 
 class Fitted(NamedTuple):
@@ -160,15 +160,19 @@ def each_row(frames: Frames, function: Callable[[FloatArray], FloatArray]) -> Fr
     return frames._replace(**rows)
 
 
+def _moved_up(frames: Frames, behind: FloatArray | IntArray | BoolArray) -> Frames:
+    """Return the buffer in which each row holds that of so many rows behind it, (..., F or 1)."""
+    kept = np.minimum(np.arange(FRAMES) + behind, FRAMES - 1)
+    return each_row(frames, lambda array: pick(array, kept, axes=1))
+
+
 def _thinned(frames: Frames) -> Frames:
     """Return the buffer without the old frame whose neighbours are nearest to each other in time."""
     rows = np.arange(FRAMES)
     gaps = frames.time[..., 2:] - frames.time[..., :-2]
     old = rows[2:] < frames.number[..., None] - RECENT
     dropped = 1 + np.where(old, gaps, np.inf).argmin(axis=-1)
-    behind = rows >= dropped[..., None]
-    kept = np.minimum(rows + behind, FRAMES - 1)
-    thinned = each_row(frames, lambda array: pick(array, kept, axes=1))
+    thinned = _moved_up(frames, rows >= dropped[..., None])
     return thinned._replace(number=frames.number - 1)
 
 
@@ -180,7 +184,7 @@ def added(
     valid: BoolArray,
     path: FloatArray,
 ) -> Frames:
-    """Return the buffer with one more frame, given `path` (..., J, 2n), and one less from `most` (...) on."""
+    """Return the buffer with one more frame, of `path` (..., J, 2n), for an old one where it holds `most` (...)."""
     frames = branch(frames.number >= most, _thinned, frames)
     here = np.arange(FRAMES) == frames.number[..., None]
     new = {"time": time, "feature": feature, "weight": valid.astype(np.float64), "path": path}
@@ -204,12 +208,9 @@ def first(frames: Frames, most: int) -> Frames:
 
 def last(frames: Frames, most: int) -> Frames:
     """Return the buffer with the last frames alone, `most` at most."""
-    rows = np.arange(FRAMES)
     number = np.minimum(frames.number, most)
-    behind = (frames.number - number)[..., None]
-    kept = np.minimum(rows + behind, FRAMES - 1)
-    fewer = each_row(frames, lambda array: pick(array, kept, axes=1))
-    there = rows < number[..., None]
+    fewer = _moved_up(frames, (frames.number - number)[..., None])
+    there = np.arange(FRAMES) < number[..., None]
     weight = fewer.weight * there[..., None]
     return fewer._replace(weight=weight, number=number)
 
@@ -275,8 +276,10 @@ class Fit:
         self.stride = max(1, round(GRID / period))
         self.grid = self.stride * period
         self.rows = 1 + int(np.ceil(LONGEST / self.grid))
-        self._own = len(model.names)  # entries of θ that are the model's
         names = (*model.names, *GEARS)
+        self._model = slice(len(model.names))
+        self._play = names.index("play")
+        self._ripple = names.index("ripple")
         self.count = len(names)
         self._cores = np.full(len(names), np.inf)
         self._largest = np.full(len(names), np.inf)
@@ -287,7 +290,7 @@ class Fit:
             self._largest[index] = LARGEST.get(kind, np.inf)
             self._spreads[:, index] = SPREADS.get(kind, (0.0,) * 4)
         self._turns = [index for index, name in enumerate(names) if "turn_" in name]
-        places = range(model.pose_columns.start, self._own)
+        places = range(model.pose_columns.start, len(model.names))
         self._places = [index for index in places if index not in self._turns]
         self._zeros = model.columns("zero_")
         self.first_turn = names.index("camera_turn_z")
@@ -329,45 +332,49 @@ class Fit:
         q, _ = self.exposed(members, frames.path)
         weight = np.minimum.reduce(frames.weight, axis=-1)[..., None, :]
         features = self.scale * frames.feature[..., None, :, :]
-        theta = members.theta[..., : self._own]
+        theta = members.theta[..., self._model]
         cameras = self.model.placed(theta, members.cameras, q.joints, features, weight)
         return members._replace(cameras=cameras)
 
     def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
         """Return joints behind gears at the exposures of frames with paths (..., F, J, 2n), and their velocities."""
-        across, rate = at_latency(path, members.latency, self.grid)
-        q = self.geared(members, across)
-        velocity, crossing = np.split(rate, 2, axis=-1)
-        play = members.theta[..., self._own, None, None]
-        return q, q.slope * velocity + play * crossing
+        row, rate = at_latency(path, members.latency, self.grid)
+        q = self.geared(members, row)
+        velocity, place_rate = np.split(rate, 2, axis=-1)
+        play = members.theta[..., self._play, None, None]
+        return q, q.slope * velocity + play * place_rate
 
-    def geared(self, members: Members, across: FloatArray) -> Geared:
+    def geared(self, members: Members, row: FloatArray) -> Geared:
         """Return joints behind gears for reported ones and x, (..., E, F, 2n)."""
-        q, x = np.split(across, 2, axis=-1)
-        play, ripple = np.moveaxis(members.theta[..., self._own :, None, None], -3, 0)
+        q, x = np.split(row, 2, axis=-1)
+        play = members.theta[..., self._play, None, None]
+        ripple = members.theta[..., self._ripple, None, None]
         phase = RIPPLE_ORDER * q
         wave = np.sin(phase)
         slope = 1.0 + ripple * RIPPLE_ORDER * np.cos(phase)
         return Geared(q + ripple * wave + play * x, slope, wave, x)
 
-    def crossed(
-        self, members: Members, share: FloatArray, across: FloatArray, q: FloatArray
+    def next_row(
+        self, members: Members, share: FloatArray, row: FloatArray, q: FloatArray
     ) -> FloatArray:
-        """Return reported joints that moved to `q` (..., n) [rad] and x there, given both before, (..., 2n)."""
-        before, x = np.split(across, 2, axis=-1)
-        play = np.vecdot(share, members.theta[..., self._own])
-        size = np.maximum(play, MIN_PLAY)[..., None]
+        """Return q and x after reported joints moved to `q` (..., n) [rad], given those before, (..., 2n).
+
+        The play is the mean of the members', by their weights `share` (..., E).
+        """
+        before, x = np.split(row, 2, axis=-1)
+        play = np.vecdot(share, members.theta[..., self._play])
+        size = np.maximum(play, ASSUMED_PLAY)[..., None]
         after = np.clip(x - (q - before) / size, -1.0, 1.0)
         return np.concatenate([q, after], axis=-1)
 
     def feature(self, members: Members, q: Geared, turn: FloatArray) -> FloatArray:
         """Return the features of members, (..., E, F, m), in the unit of the model, the cameras turned by `turn`."""
-        theta = members.theta[..., : self._own]
+        theta = members.theta[..., self._model]
         return self.model.feature(theta, members.cameras, q.joints, turn)
 
     def derivatives(self, members: Members, q: Geared, turn: FloatArray) -> Derivatives:
         """Return the same with derivatives, by joints behind the gears."""
-        theta = members.theta[..., : self._own]
+        theta = members.theta[..., self._model]
         return self.model.derivatives(theta, members.cameras, q.joints, turn)
 
     def fitted(self, members: Members, frames: Frames) -> Fitted:
@@ -384,9 +391,9 @@ class Fit:
         by_parameter = np.swapaxes(found.by_parameter, -1, -3)
         shape = by_parameter.shape
         rates = np.empty((*shape[:-3], self.count + 2, *shape[-2:]))
-        np.multiply(by_parameter, size[..., None, :, :], out=rates[..., : self._own, :, :])
-        rates[..., self._own, :, :] = _along(by_joint, q.across)
-        rates[..., self._own + 1, :, :] = _along(by_joint, q.wave)
+        np.multiply(by_parameter, size[..., None, :, :], out=rates[..., self._model, :, :])
+        rates[..., self._play, :, :] = _along(by_joint, q.place)
+        rates[..., self._ripple, :, :] = _along(by_joint, q.wave)
         rates[..., -2, :, :] = -motion
         rates[..., -1, :, :] = rates[..., self.first_turn, :, :] * since[..., None, :]
         return Fitted(self._missed(frames, found.feature), rates, motion)
@@ -509,12 +516,10 @@ class Fit:
         """Return members after a step (..., E, P + 2), within bounds."""
         own = step[..., : self.count]
         later, turning = np.moveaxis(step[..., self.count :], -1, 0)
-        model = slice(self._own)
-        moved, cameras = self.model.moved(
-            members.theta[..., model], members.cameras, own[..., model]
-        )
-        gears = members.theta[..., self._own :] + own[..., self._own :]
-        theta = np.concatenate([moved, gears], axis=-1)
+        theta = members.theta + own
+        before = members.theta[..., self._model]
+        increment = own[..., self._model]
+        theta[..., self._model], cameras = self.model.moved(before, members.cameras, increment)
         latency = members.latency + later
         return members._replace(
             theta=np.clip(theta, self._least, self._largest),

@@ -61,7 +61,7 @@ MIN_TRAVEL: Final = 2.0  # [rad] motion of all joints before it is
 EXPLAINED: Final = 1.3  # [1] residuals in σ up to which frames are explained
 LEAST_LATENESS: Final = 0.012  # [s] below which there is none
 FAST: Final = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
-BROKEN: Final = 3.0  # [1] least error of a frame in σ that tells a moved camera
+MOVE_ERROR: Final = 3.0  # [1] error of a frame in σ from which on it tells a moved camera
 UNEXPLAINED: Final = 1.6  # [1] residuals in σ from which on new members are tried
 LAST_TRIAL: Final = 30.0  # [s]
 MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
@@ -107,7 +107,7 @@ class CalibrationState(NamedTuple):
 
     begin: float  # [s] time of the first observation
     elapsed: float  # [s] from it to the last one
-    # Joint positions of the last periods and how far they are across their play, the newest first, (..., h, 2n)
+    # Joint positions q [rad] of the last periods and their places x within the play, the newest first, (..., h, 2n)
     history: FloatArray
     frames: Frames
     members: Members
@@ -159,15 +159,15 @@ class Calibration:
         zero = np.zeros(lead, dtype=np.int_)[()]
         rows = (*lead, FRAMES)
         features = np.zeros((*rows, m))
-        across = np.concatenate([q, np.zeros_like(q)], axis=-1)
-        paths = np.zeros((*rows, fit.rows, across.shape[-1]))
+        row = np.concatenate([q, np.zeros_like(q)], axis=-1)
+        paths = np.zeros((*rows, fit.rows, row.shape[-1]))
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
         members = fit.start(lead, FIRST_MEMBERS, none)
         size = (*lead, FIRST_MEMBERS)
         periods = self._periods
         if np.isfinite(observation.capture_time).any():
             periods += whole_periods(MAX_LATENESS, self._period)
-        history = np.repeat(across[..., None, :], periods, axis=-2)
+        history = np.repeat(row[..., None, :], periods, axis=-2)
         return CalibrationState(
             begin=float(observation.time),
             elapsed=0.0,
@@ -213,10 +213,11 @@ class Calibration:
             late: by which the frame is known to be later than others, (...) [s]; None where nothing is known.
         """
         before = state.history[..., 0, :]
-        across = self.fit.crossed(state.members, state.share, before, observation.joint_position)
-        step = self._joints(across - before)
+        q = observation.joint_position
+        row = self.fit.next_row(state.members, state.share, before, q)
+        step = q - self._joints(before)
         earlier = state.history[..., :-1, :]
-        history = np.concatenate([across[..., None, :], earlier], axis=-2)
+        history = np.concatenate([row[..., None, :], earlier], axis=-2)
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
         state = state._replace(history=history, travel=travel, elapsed=elapsed)
@@ -255,9 +256,10 @@ class Calibration:
         noise = np.where(known, across, noise)
         state = state._replace(frames=frames, noise=noise)
         if past:
-            state, far = self._judged(state, y, path, instant, delay, past)
-            broken = far & (regression.moves > state.moves)
-            state = branch(broken, self._moved, state._replace(moves=regression.moves))
+            state, missed = self._judged(state, y, path, instant, delay, past)
+            camera_moved = missed & (regression.moves > state.moves)
+            state = branch(camera_moved, self._after_move, state._replace(moves=regression.moves))
+            frames = state.frames
         many = frames.number >= MANY_FRAMES
         level = np.where(
             many & state.fitted, np.minimum(noise, EXPLAINED * state.rms + 0.2e-3), noise
@@ -279,23 +281,22 @@ class Calibration:
             state = branch(tries, self._tried, state, elapsed, level)
         return state
 
-    def _moved(self, state: CalibrationState) -> CalibrationState:
-        """Return the state in which the camera was moved: the arms stay, of the frames the last few."""
+    def _after_move(self, state: CalibrationState) -> CalibrationState:
+        """Return the state after a move of the camera: arms stay as they are, of the frames the last ones."""
         members = state.members
-        fresh = np.full_like(members.damping, FIRST_DAMPING)
-        return state._replace(
-            frames=last(state.frames, MOVED_FRAMES),
-            members=members._replace(damping=fresh, centre=members.theta),
-            fitted=np.zeros_like(state.fitted),
-            errors=np.full_like(state.errors, np.nan),
-            trial=state.trial._replace(
-                iterations=np.full_like(state.trial.iterations, TRIAL_ITERATIONS)
-            ),
-        )
+        damping = np.full_like(members.damping, FIRST_DAMPING)
+        arms = members._replace(damping=damping, centre=members.theta)
+        ended = np.full_like(state.trial.iterations, TRIAL_ITERATIONS)
+        trial = state.trial._replace(iterations=ended)
+        frames = last(state.frames, MOVED_FRAMES)
+        state = state._replace(frames=frames, members=arms, trial=trial)
+        fitted = np.zeros_like(state.fitted)
+        unknown = np.full_like(state.errors, np.nan)
+        return state._replace(fitted=fitted, errors=unknown)
 
-    def _joints(self, across: FloatArray) -> FloatArray:
+    def _joints(self, rows: FloatArray) -> FloatArray:
         """Return joint positions alone, (..., n), of rows (..., 2n) of the history."""
-        return across[..., : self._n]
+        return rows[..., : self._n]
 
     def _path(self, history: FloatArray, late: FloatArray | None) -> FloatArray:
         """Return rows of the history up to `late` (...) [s] ago, (..., J, 2n), the newest last."""
@@ -312,7 +313,7 @@ class Calibration:
     def _begun(
         self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
-        """Return the state with members fitted for the first time."""
+        """Return the state with members fitted for the first time, or anew after a move of the camera."""
         frames = self._in_use(state, elapsed)
         late = np.broadcast_to(delay[..., None], state.share.shape)
         members = state.members._replace(latency=late)
@@ -428,10 +429,11 @@ class Calibration:
         delay: FloatArray,
         past: tuple[Known, ...],
     ) -> tuple[CalibrationState, BoolArray]:
-        """Return the state with the errors of both in predicting a frame from what was known some frames ago.
+        """Judge the predictions of a frame by what was known `HORIZON` frames before.
 
-        And whether the arm's is larger than any lateness explains, (...): late frames are off by a part of the way of
-        the last periods.
+        Returns:
+            The state with the errors of regression and arm, and whether the arm misses the frame, (...): by more than
+            noise and all of the feature's way along the path, the most by which a late frame can be off.
         """
         known = past[0]
         fit = self.fit
@@ -452,9 +454,9 @@ class Calibration:
         steps = self._joints(np.diff(path, axis=-2))
         ways = np.matvec(known.jacobian[..., None, :, :], steps)
         way = np.add.reduce(norm(ways), axis=-1)
-        far = norm(errors[..., 1, :]) > BROKEN * state.noise + way
+        missed = norm(errors[..., 1, :]) > MOVE_ERROR * state.noise + way
         new = state._replace(errors=np.where(comparable[..., None], mean, state.errors))
-        return new, np.asarray(known.fitted & far)
+        return new, np.asarray(known.fitted & missed)
 
     def _exposed(self, path: FloatArray, delay: FloatArray) -> FloatArray:
         """Return joint positions, (..., n) [rad], a delay (...) [s] before the end of a path (..., J, 2n)."""
@@ -553,8 +555,8 @@ class Calibration:
         """Return the prediction for joints that are bound to reach `bound` (..., n) after `lead` (...) periods."""
         fit = self.fit
         members = state.members
-        across = fit.crossed(members, state.share, state.history[..., 0, :], bound)
-        q = fit.geared(members, across[..., None, None, :])
+        row = fit.next_row(members, state.share, state.history[..., 0, :], bound)
+        q = fit.geared(members, row[..., None, None, :])
         ahead = lead[..., None] * self._period
         since = state.elapsed + ahead + members.latency
         turn = (members.turning * since)[..., None]

@@ -60,14 +60,14 @@ def driven(mechanics, times):
     return np.array(rows)
 
 
-def crossed(fit, time, size):
-    """Return joints and how far they are across a play of ±`size` at times, (..., 12), the oldest of which is first."""
+def rows_of_history(fit, time, size):
+    """Return joints and their places within a play of ±`size` at times, (..., 12), the oldest of which is first."""
     members = fit.start((), 1, np.float64(0.0))
     members.theta[:, PLAY] = size
     row = np.concatenate([joints_at(time[0]), np.zeros(6)])
     rows = []
     for each in time:
-        row = fit.crossed(members, np.ones(1), row, joints_at(each))
+        row = fit.next_row(members, np.ones(1), row, joints_at(each))
         rows.append(row)
     return np.array(rows)
 
@@ -83,14 +83,14 @@ def made_up(fit, seconds=4.0, deviations=TRUE, mechanics=NO_PLAY):
     frames = empty(fit)
     times = np.arange(-1.0, seconds, FINE)
     behind = driven(mechanics, times)
-    across = crossed(fit, times, 0.5 * mechanics.backlash)
+    history = rows_of_history(fit, times, 0.5 * mechanics.backlash)
     first = round(1.0 / FINE)
     stride = round(PERIOD / FINE)
     late = round(LATENCY / FINE)
     for last in range(first, len(times), stride):
         exposed = behind[last - late][None]
         y = model.feature(theta, cameras, exposed)[0] + NOISE * generator.standard_normal(3)
-        path = across[last - stride * (fit.rows - 1) : last + 1 : stride]
+        path = history[last - stride * (fit.rows - 1) : last + 1 : stride]
         time = np.float64(times[last])
         frames = added(frames, np.int_(FRAMES), time, y, np.ones(3, dtype=bool), path)
     return frames, theta, cameras
@@ -205,10 +205,10 @@ def test_play_and_ripple_of_the_plants_gears_are_found():
     assert best[PLAY] == pytest.approx(0.015, abs=3e-3)
 
 
-def test_how_far_joints_are_across_their_play_is_as_on_the_plant():
+def test_places_of_joints_within_their_play_are_those_on_the_plant():
     fit = fit_of_ur5()
     size = 0.015
     times = np.arange(0.0, 6.0, FINE)
     behind = driven(MechanicsConfig(backlash=size), times)
     wanted = (behind - joints_at(times)) / size
-    np.testing.assert_allclose(crossed(fit, times, size)[:, 6:], wanted, atol=1e-9)
+    np.testing.assert_allclose(rows_of_history(fit, times, size)[:, 6:], wanted, atol=1e-9)
