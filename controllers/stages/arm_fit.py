@@ -48,6 +48,7 @@ SPREADS: Final = {
     "target": (0.01, 0.05, 0.15, 0.2),  # [m]
     "link": (0.03, 0.05, 0.15, 0.3),  # [1]
 }
+DRAWS: Final = 2048  # rows of their table
 GEARS: Final = ("play", "ripple")  # b and a [rad], the last entries of θ
 CORES: Final = {
     "zero": 0.08,
@@ -297,7 +298,7 @@ class Fit:
         self._least = np.where([name == "play" for name in names], 0.0, -self._largest)
         # Where members begin, in shares of their spreads; the same in every run.
         generator = np.random.default_rng(12345)
-        self._draws = generator.uniform(-1.0, 1.0, (256, len(names)))
+        self._draws = generator.uniform(-1.0, 1.0, (DRAWS, len(names)))
         _, self._planned = model.start(())
 
     def start(self, lead: tuple[int, ...], count: int, latency: FloatArray) -> Members:
@@ -335,6 +336,26 @@ class Fit:
         theta = members.theta[..., self._model]
         cameras = self.model.placed(theta, members.cameras, q.joints, features, weight)
         return members._replace(cameras=cameras)
+
+    def screened(
+        self, members: Members, frames: Frames, variance: FloatArray, count: int
+    ) -> Members:
+        """Return the best of members before any iteration, their cameras placed.
+
+        They are compared without priors, by which near arms would win while no arm is near the frames yet.
+
+        Args:
+            members: (..., E).
+            frames: which they are to fit.
+            variance: σ² of the comparison, (..., E).
+            count: how many are returned.
+        """
+        members = self.aligned(members, frames)
+        residual = self.residual(members, frames)
+        square = squared(residual) / variance[..., None]
+        cost = np.add.reduce(np.log1p(square / STUDENT), axis=-1)
+        best = np.argsort(cost, axis=-1)[..., :count]
+        return Members(*(pick(each, best, axes=1) for each in members))
 
     def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
         """Return joints behind gears at the exposures of frames with paths (..., F, J, 2n), and their velocities."""

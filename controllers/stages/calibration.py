@@ -1,18 +1,24 @@
 """The calibrating stage: an arm that is fitted while it servoes (`arm_fit`), and whether to believe it.
 
 The arm and the regression predict each frame from what was known `HORIZON` frames before. The fitted arm is used while
-the mean square of its errors is below a multiple (`GATE`) of that of the regression: a small one while there are few
-frames, which fit any arm, a larger one once it explains all frames to their noise.
+the mean square of its errors is below a multiple (`GATE`) of that of the regression, a larger one once it explains all
+frames to their noise.
+
+Few frames fit many arms, and of those that are far away an iteration finds the right one slowly. While no member
+explains the frames, all of them make several iterations from frame to frame, and the worst ones are replaced by the
+best of many new arms. With more frames there are fewer members, so that the work of an iteration stays the same.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.choice import choose
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.arm_fit import (
     FIRST_DAMPING,
@@ -40,22 +46,26 @@ from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
-FIRST_MEMBERS: Final = 24  # members until `FIRST_TIME`
-FIRST_TIME: Final = 0.6  # [s]
-MEMBERS: Final = 3  # members from then on
+FIRST_MEMBERS: Final = 32  # members at first
+SEARCHED: Final = 16  # least number of members until `SEARCH_TIME`
+MEMBERS: Final = 3  # members at last
+WORK: Final = 240  # product of members and frames that is not exceeded by more
+SEARCH_TIME: Final = (
+    1.5  # [s] until which members that do not explain the frames are searched for an arm that does
+)
+SEARCH_ITERATIONS: Final = 8  # their iterations from frame to frame
 ITERATION_INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
 FIRST_ITERATIONS: Final = 6
 MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
 NOISE: Final = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
 BIAS_TIME: Final = 0.4  # [s] over which the residuals' mean is taken
-HORIZON: Final = 5  # frames
-MEMORY: Final = 0.9  # [1] share of the errors that is kept from frame to frame
+HORIZON: Final = 2  # frames
+# [1] shares of the errors that are kept from frame to frame: with few frames, which change much, and with many
+MEMORIES: Final = (0.6, 0.9)
 MAX_ERROR: Final = 12.0  # [1] largest error that counts, in σ
 GATE: Final = 0.9  # [1] below 1: errors of both are limited, so that two bad predictions are equal
 HYSTERESIS: Final = (0.8, 1.25)  # [1] factors of the gate before and while the arm is used
-FEW_FRAMES: Final = 25
 MANY_FRAMES: Final = 40
-FEW_GATE: Final = 0.6  # [1] factor of the gate with few frames
 KNOWN_GATE: Final = 2.0  # [1] factor of the gate where all frames are explained
 MIN_TRAVEL: Final = 2.0  # [rad] motion of all joints before it is
 EXPLAINED: Final = 1.3  # [1] residuals in σ up to which frames are explained
@@ -67,8 +77,15 @@ LAST_TRIAL: Final = 30.0  # [s]
 MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
 CANDIDATES: Final = 8  # new members that are tried at once
+SCREENED: Final = 256  # new members at most of which these are the best, before any iteration
+SCREENING_WORK: Final = 4096  # product of them and frames that is not exceeded
+SCREENING: Final = (
+    25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
+)
 TRIAL_ITERATIONS: Final = 12  # iterations of a trial
-ITERATIONS_A_FRAME: Final = 2  # iterations of a trial at each frame
+TRIAL_WORK: Final = (
+    960  # product of candidates, frames and iterations at a frame that is not exceeded
+)
 
 
 class Regressed(NamedTuple):
@@ -147,6 +164,9 @@ class Calibration:
         self._n = knowledge.spec.n
         self.fit = Fit(model, knowledge.unit, self._period)
         self._periods = 1 + (self.fit.rows - 1) * self.fit.stride
+        frame_periods = max(1, whole_periods(MOTION_TIME, self._period))
+        self._frame_time = frame_periods * self._period
+        self._iterations = math.ceil((SEARCH_ITERATIONS - 1) / frame_periods)
 
     def start(self, observation: Observation) -> CalibrationState:
         """Return the state before any frame."""
@@ -221,13 +241,40 @@ class Calibration:
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
         state = state._replace(history=history, travel=travel, elapsed=elapsed)
-        if elapsed > FIRST_TIME and state.share.shape[-1] > MEMBERS:
-            state = self._reduced(state, MEMBERS)
+        least = MEMBERS
+        if elapsed <= SEARCH_TIME:
+            least = SEARCHED
+        size = max(least, WORK // self._most_frames(elapsed))
+        if state.share.shape[-1] > size:
+            state = self._reduced(state, size)
         past = state.past
-        state = branch(
-            due, self._learn, state._replace(past=()), observation, regression, past, elapsed, late
-        )
+        state = state._replace(past=())
+        state = branch(due, self._learn, state, observation, regression, past, elapsed, late)
+        state = branch(~due & self._unexplained(state), self._searched, state, elapsed, state.noise)
         return state._replace(past=self._remembered(past, state, due, regression))
+
+    def _most_frames(self, elapsed: float) -> int:
+        """Return the largest number of frames that there can be, which does not depend on other lanes."""
+        return 1 + round(elapsed / self._frame_time)
+
+    def _unexplained(self, state: CalibrationState) -> BoolArray:
+        """Return whether members are still searched for an arm that explains the frames, (...)."""
+        if state.elapsed > SEARCH_TIME:
+            return np.zeros_like(state.fitted)
+        return np.asarray(state.fitted & (state.rms > EXPLAINED * state.noise))
+
+    def _searched(
+        self, state: CalibrationState, elapsed: float, noise: FloatArray
+    ) -> CalibrationState:
+        """Return the state after further iterations, of which each period makes a part."""
+        fit = self.fit
+        frames = self._in_use(state, elapsed)
+        variance = np.broadcast_to(_floor(noise), state.share.shape)
+        members = state.members
+        for _ in range(self._iterations):
+            fitted = fit.fitted(members, frames)
+            members, _ = fit.iterated(members, frames, fitted, state.lateness, variance)
+        return state._replace(members=members)
 
     def _learn(
         self,
@@ -270,13 +317,18 @@ class Calibration:
         state = branch(begins, self._begun, state, elapsed, delay, level)
         state = state._replace(passed=state.passed + 1)
         explained = many & (state.rms < EXPLAINED * noise)
+        unexplained = self._unexplained(state)
+        state = branch(unexplained, self._refreshed, state, elapsed, delay, level)
+        state = branch(unexplained, self._searched, state, elapsed, level)
         iterates = state.fitted & (~explained | (state.passed >= ITERATION_INTERVAL))
         state = branch(iterates, self._continued, state, elapsed, level)
         used = self._trusted(state)
         lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
-        new = lost & (state.trial.iterations == TRIAL_ITERATIONS) & (time < LAST_TRIAL)
+        later = (time > SEARCH_TIME) & (time < LAST_TRIAL)
+        new = lost & (state.trial.iterations == TRIAL_ITERATIONS) & later
         state = branch(new, self._try_more, state._replace(used=used), elapsed, delay, level)
-        for _ in range(ITERATIONS_A_FRAME):
+        affordable = TRIAL_WORK // (CANDIDATES * self._most_frames(elapsed))
+        for _ in range(min(max(affordable, 1), TRIAL_ITERATIONS)):
             tries = state.trial.iterations < TRIAL_ITERATIONS
             state = branch(tries, self._tried, state, elapsed, level)
         return state
@@ -308,7 +360,7 @@ class Calibration:
 
     def _in_use(self, state: CalibrationState, elapsed: float) -> Frames:
         """Return the frames, without rows for which there were too few periods so far."""
-        return first(state.frames, 1 + round(elapsed / self._period))
+        return first(state.frames, self._most_frames(elapsed))
 
     def _begun(
         self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
@@ -448,7 +500,9 @@ class Calibration:
         errors = np.stack([y - by_regression, y - by_arm], axis=-2)
         most = np.square(MAX_ERROR * state.noise)[..., None]
         squares = np.minimum(np.vecdot(errors, errors), most)
-        mean = MEMORY * state.errors + (1.0 - MEMORY) * squares
+        few, many = MEMORIES
+        memory = np.where(state.frames.number < MANY_FRAMES, few, many)[..., None]
+        mean = memory * state.errors + (1.0 - memory) * squares
         mean = np.where(np.isnan(state.errors), squares, mean)
         comparable = known.fitted & (known.moves == state.moves)
         steps = self._joints(np.diff(path, axis=-2))
@@ -472,7 +526,6 @@ class Calibration:
             & (state.rms < EXPLAINED * state.noise)
         )
         gate = np.where(explained, KNOWN_GATE * gate, gate)
-        gate = np.where(count < FEW_FRAMES, FEW_GATE * gate, gate)
         better = state.errors[..., 1] < gate * state.errors[..., 0]
         return np.asarray(state.fitted & better)
 
@@ -480,9 +533,27 @@ class Calibration:
         self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
         """Return the state in which a trial begins."""
-        new = self.fit.spawned(state.travel.shape, state.spawned, CANDIDATES, delay)
+        state, new = self._screened(state, elapsed, delay, noise)
         trial = self._begun_trial(new, self._in_use(state, elapsed), noise)
-        return state._replace(trial=trial, spawned=state.spawned + CANDIDATES)
+        return state._replace(trial=trial)
+
+    def _refreshed(
+        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
+    ) -> CalibrationState:
+        """Return the state with new members for the worst ones."""
+        state, new = self._screened(state, elapsed, delay, noise)
+        return self._together(self._reduced(state, state.share.shape[-1] - CANDIDATES), new)
+
+    def _screened(
+        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
+    ) -> tuple[CalibrationState, Members]:
+        """Return new members that fit the frames best of many before any iteration."""
+        most = SCREENING_WORK // self._most_frames(elapsed)
+        count = min(max(most, CANDIDATES), SCREENED)
+        new = self.fit.spawned(state.travel.shape, state.spawned, count, delay)
+        coarse = np.broadcast_to(SCREENING * _floor(noise), new.cost.shape)
+        new = self.fit.screened(new, self._in_use(state, elapsed), coarse, CANDIDATES)
+        return state._replace(spawned=state.spawned + count), new
 
     def _tried(
         self, state: CalibrationState, elapsed: float, noise: FloatArray
@@ -495,16 +566,19 @@ class Calibration:
 
     def _joined(self, state: CalibrationState) -> CalibrationState:
         """Return the state with the best of the old members and of those that were tried."""
-        size = state.share.shape[-1]
+        every = self._together(state, state.trial.members)
+        return self._reduced(every, state.share.shape[-1])
+
+    def _together(self, state: CalibrationState, new: Members) -> CalibrationState:
+        """Return the state with new members beside the old ones."""
         axis = state.travel.ndim
-        nothing = np.zeros((*state.travel.shape, CANDIDATES))
-        pairs = zip(state.members, state.trial.members, strict=True)
+        nothing = np.zeros_like(new.cost)
+        pairs = zip(state.members, new, strict=True)
         members = Members(*(np.concatenate(pair, axis=axis) for pair in pairs))
         share = np.concatenate([state.share, nothing], axis=-1)
         no_bias = np.zeros((*nothing.shape, self._m))
         bias = np.concatenate([state.bias, no_bias], axis=axis)
-        more = state._replace(members=members, share=share, bias=bias)
-        return self._reduced(more, size)
+        return state._replace(members=members, share=share, bias=bias)
 
     def _reduced(self, state: CalibrationState, size: int) -> CalibrationState:
         """Return the state with the best members alone, as many as `size`."""
