@@ -212,3 +212,17 @@ def test_places_of_joints_within_their_play_are_those_on_the_plant():
     behind = driven(MechanicsConfig(backlash=size), times)
     wanted = (behind - joints_at(times)) / size
     np.testing.assert_allclose(rows_of_history(fit, times, size)[:, 6:], wanted, atol=1e-9)
+
+
+def test_screening_places_the_camera_and_takes_the_arm_that_fits_before_any_iteration():
+    fit = fit_of_ur5()
+    frames, theta, _ = made_up(fit)
+    many = fit.spawned((), np.int_(0), 40, np.float64(LATENCY))
+    many.theta[17, :PLAY] = theta
+    variance = np.full(40, 25.0 * NOISE**2)
+    best = fit.screened(many, frames, variance, 3)
+    np.testing.assert_allclose(best.theta[0, :PLAY], theta)
+    own = np.median(squared(fit.residual(best, frames)), axis=-1)
+    # Three coordinates of noise, and what the placed camera fits of it.
+    assert own[0] < 3.0 * NOISE**2
+    assert np.all(own[1:] > 2.0 * own[0])
