@@ -214,7 +214,7 @@ def test_places_of_joints_within_their_play_are_those_on_the_plant():
     np.testing.assert_allclose(rows_of_history(fit, times, size)[:, 6:], wanted, atol=1e-9)
 
 
-def test_screening_places_the_camera_and_takes_the_arm_that_fits_before_any_iteration():
+def test_screening_places_the_camera_and_takes_the_arm_that_fits():
     fit = fit_of_ur5()
     frames, theta, _ = made_up(fit)
     many = fit.spawned((), np.int_(0), 40, np.float64(LATENCY))
