@@ -1,6 +1,7 @@
 """Identify hidden plants from 60 s of log each: coverage of intervals by parameter, latency, false alarms.
 
 python benchmarks/hidden_plants.py --plant kinematic --robots 200 --first 81000
+python benchmarks/hidden_plants.py --mismatch moderate+joint_offsets=180deg --robots 40
 """
 
 import time
@@ -12,7 +13,7 @@ import pandas as pd
 import servobench
 from measuring import options
 from servobench.harness.apps.twin.drive import command_response
-from servobench.harness.apps.twin.identification import read_log
+from servobench.harness.apps.twin.identification import Log, read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings
@@ -75,9 +76,18 @@ def draw_hidden(seed: int, plant: str) -> tuple[str, str, dict[str, Any]]:
     )
 
 
-def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
-    """Identify one hidden plant, and return a row a parameter."""
+def jacobian_error(log: Log, twin: RobotModel, true: RobotModel) -> float:
+    """Return how wrong the Jacobian of a twin is along a log, as a share of the true one."""
+    q = log.joints[::50]
+    wanted = np.asarray(true.jacobian(q))
+    missed = np.asarray(twin.jacobian(q)) - wanted
+    return float(np.linalg.norm(missed) / np.linalg.norm(wanted))
+
+
+def hidden(seed: int, plant: str, words: str) -> list[dict[str, Any]]:
+    """Identify one hidden plant, of a mismatch if one is given, and return a row a parameter."""
     robot, mismatch, sections = draw_hidden(seed, plant)
+    mismatch = words or mismatch
     latency, delay = sections["sensing"]["latency"], sections["command_delay"]
     # Engines have a table
     task, reach = ("random", np.inf) if plant == "kinematic" else ("target", 0.15)
@@ -113,7 +123,10 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
     response = command_response(log)
     about |= {"seconds": time.perf_counter() - began, "said": said}
     rows: list[tuple[Any, ...]] = []
-    true = parameters(draw_robot(request)[0], nominal) | {"latency": latency}
+    robot_drawn = draw_robot(request)[0]
+    true = parameters(robot_drawn, nominal) | {"latency": latency}
+    if found is not None:
+        about["jacobian"] = jacobian_error(log, found.model(nominal), robot_drawn)
     if response is not None:
         errors = response.delay - delay, response.lag - sections.get("lag", np.nan)
         sizes = np.maximum(np.sqrt(np.diag(response.covariance)), 1e-4)
@@ -132,12 +145,12 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Print the tables."""
-    given = options(__doc__, plant="kinematic", robots=200, first=81000)
+    given = options(__doc__, plant="kinematic", robots=200, first=81000, mismatch="")
     table = pd.DataFrame(
         [
             row
             for seed in range(given.first, given.first + given.robots)
-            for row in hidden(seed, given.plant)
+            for row in hidden(seed, given.plant, given.mismatch)
         ]
     )
     runs = table.drop_duplicates("seed")
@@ -145,6 +158,8 @@ def main() -> None:
         f"{len(runs)} logs, {(runs['said'] != '').sum()} with a line, median {runs['seconds'].median():.1f} s a log"
     )
     print(runs.loc[runs["said"] != "", ["seed", "robot", "mismatch", "said"]].to_string())
+    if "jacobian" in runs:
+        print(f"Jacobian of the twin within 1 %: {(runs['jacobian'] < 0.01).sum()} of {len(runs)}")
     late = table[table["parameter"] == "latency"]
     error = late["error"].abs()
     print(f"latency within 5 ms: {(error < 0.005).mean():.1%}, largest error {error.max():.4f} s")

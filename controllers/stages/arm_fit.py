@@ -75,6 +75,7 @@ FLOOR: Final = 0.3e-3  # [m] least σ, in natural units
 FIRST_DAMPING: Final = 1e-2  # [1] λ
 DAMPING_FACTORS: Final = (0.2, 8.0)  # [1] of λ after a step that is made, and one that is not
 DAMPINGS: Final = (1e-6, 1e4)  # [1] between which λ lies
+ANNEALED: Final = 6  # iterations in which the noise of new members falls to its true size
 MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
 # Rows that a spline needs, counted from the last one before an instant
 SUPPORT: Final = np.array([-1, 0, 1, 2])
@@ -102,6 +103,14 @@ class Members(NamedTuple):
     turning: FloatArray  # ω, (..., E) [rad/s]
     damping: FloatArray  # λ of Levenberg and Marquardt, (..., E)
     cost: FloatArray  # (..., E)
+
+
+class Trial(NamedTuple):
+    """New members, whose first iterations take noise for larger, so that wrong arms come near."""
+
+    members: Members
+    variance: FloatArray  # σ² of the residuals with which they begin, (..., E)
+    iterations: IntArray  # made so far, (...)
 
 
 class Geared(NamedTuple):
@@ -278,6 +287,7 @@ class Fit:
         self.grid = self.stride * period
         self.rows = 1 + int(np.ceil(LONGEST / self.grid))
         names = (*model.names, *GEARS)
+        self.names = names
         self._model = slice(len(model.names))
         self._play = names.index("play")
         self._ripple = names.index("ripple")
@@ -356,6 +366,39 @@ class Fit:
         cost = np.add.reduce(np.log1p(square / STUDENT), axis=-1)
         best = np.argsort(cost, axis=-1)[..., :count]
         return Members(*(pick(each, best, axes=1) for each in members))
+
+    def begun(self, members: Members, frames: Frames, floor: FloatArray) -> Trial:
+        """Return new members with their cameras where these fit their arms, before any iteration.
+
+        Args:
+            members: (..., E).
+            frames: which they are to fit.
+            floor: σ² of residuals that are but noise, (..., 1).
+        """
+        members = self.aligned(members, frames)
+        square = squared(self.residual(members, frames))
+        variance = np.maximum(floor, np.median(square, axis=-1) / 3.0)
+        none = np.zeros(variance.shape[:-1], dtype=np.int_)[()]
+        return Trial(members, variance, none)
+
+    def annealed(
+        self, trial: Trial, frames: Frames, lateness: FloatArray, floor: FloatArray
+    ) -> Trial:
+        """Return new members after an iteration.
+
+        Args:
+            trial: before.
+            frames: which it fits.
+            lateness: s, (...) [s].
+            floor: σ² of residuals that are but noise, (..., 1).
+        """
+        least = np.broadcast_to(floor, trial.variance.shape)
+        made = trial.iterations[..., None]
+        larger = np.maximum(least, 0.25**made * trial.variance)
+        variance = np.where(made < ANNEALED - 1, larger, least)
+        fitted = self.fitted(trial.members, frames)
+        members, _ = self.iterated(trial.members, frames, fitted, lateness, variance)
+        return trial._replace(members=members, iterations=trial.iterations + 1)
 
     def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
         """Return joints behind gears at the exposures of frames with paths (..., F, J, 2n), and their velocities."""

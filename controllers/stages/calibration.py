@@ -21,6 +21,7 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.arm_fit import (
+    ANNEALED,
     FIRST_DAMPING,
     FLOOR,
     FRAMES,
@@ -31,6 +32,7 @@ from servobench.controllers.stages.arm_fit import (
     Frames,
     IntArray,
     Members,
+    Trial,
     added,
     at_latency,
     first,
@@ -55,7 +57,6 @@ SEARCH_TIME: Final = (
 )
 SEARCH_ITERATIONS: Final = 8  # their iterations from frame to frame
 ITERATION_INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
-FIRST_ITERATIONS: Final = 6
 MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
 NOISE: Final = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
 BIAS_TIME: Final = 0.4  # [s] over which the residuals' mean is taken
@@ -109,14 +110,6 @@ class Known(NamedTuple):
     exposed: FloatArray  # joint position at the exposure, by the regression's delay, (..., n)
     fitted: BoolArray  # (...), whether the members had been fitted
     moves: IntArray  # the regression's, (...)
-
-
-class Trial(NamedTuple):
-    """New members, of which the best become members of the ensemble after `TRIAL_ITERATIONS` iterations."""
-
-    members: Members
-    variance: FloatArray  # σ² of the residuals with which they begin, (..., E)
-    iterations: IntArray  # made so far, (...); `TRIAL_ITERATIONS` where nothing is tried
 
 
 class CalibrationState(NamedTuple):
@@ -369,30 +362,11 @@ class Calibration:
         frames = self._in_use(state, elapsed)
         late = np.broadcast_to(delay[..., None], state.share.shape)
         members = state.members._replace(latency=late)
-        trial = self._begun_trial(members, frames, noise)
-        for _ in range(FIRST_ITERATIONS):
-            trial = self._iterated(trial, frames, state.lateness, noise)
+        floor = _floor(noise)
+        trial = self.fit.begun(members, frames, floor)
+        for _ in range(ANNEALED):
+            trial = self.fit.annealed(trial, frames, state.lateness, floor)
         return state._replace(members=trial.members, fitted=np.ones_like(state.fitted))
-
-    def _begun_trial(self, members: Members, frames: Frames, noise: FloatArray) -> Trial:
-        """Return new members with their cameras where these fit their arms, before any iteration."""
-        members = self.fit.aligned(members, frames)
-        square = squared(self.fit.residual(members, frames))
-        variance = np.maximum(_floor(noise), np.median(square, axis=-1) / 3.0)
-        return Trial(members, variance, np.zeros(noise.shape, dtype=np.int_)[()])
-
-    def _iterated(
-        self, trial: Trial, frames: Frames, lateness: FloatArray, noise: FloatArray
-    ) -> Trial:
-        """Return new members after an iteration; the first ones take noise for larger, so that wrong arms come near."""
-        fit = self.fit
-        floor = np.broadcast_to(_floor(noise), trial.variance.shape)
-        made = trial.iterations[..., None]
-        annealed = np.maximum(floor, 0.25**made * trial.variance)
-        variance = np.where(made < FIRST_ITERATIONS - 1, annealed, floor)
-        fitted = fit.fitted(trial.members, frames)
-        members, _ = fit.iterated(trial.members, frames, fitted, lateness, variance)
-        return trial._replace(members=members, iterations=trial.iterations + 1)
 
     def _continued(
         self, state: CalibrationState, elapsed: float, noise: FloatArray
@@ -534,7 +508,7 @@ class Calibration:
     ) -> CalibrationState:
         """Return the state in which a trial begins."""
         state, new = self._screened(state, elapsed, delay, noise)
-        trial = self._begun_trial(new, self._in_use(state, elapsed), noise)
+        trial = self.fit.begun(new, self._in_use(state, elapsed), _floor(noise))
         return state._replace(trial=trial)
 
     def _refreshed(
@@ -560,7 +534,7 @@ class Calibration:
     ) -> CalibrationState:
         """Return the state after an iteration of a trial."""
         frames = self._in_use(state, elapsed)
-        trial = self._iterated(state.trial, frames, state.lateness, noise)
+        trial = self.fit.annealed(state.trial, frames, state.lateness, _floor(noise))
         state = state._replace(trial=trial)
         return branch(trial.iterations == TRIAL_ITERATIONS, self._joined, state)
 

@@ -21,6 +21,7 @@ from servobench.harness.apps.twin.identification import (
     frames_of,
     identify,
 )
+from servobench.harness.apps.twin.search import searched
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -41,13 +42,10 @@ TIE_RATIO: Final = 1.1  # [1]
 SCREENED: Final = 6  # number of remedies that are fitted, those with the least errors
 REMEDIES_AT_ONCE: Final = 64  # remedies for which cameras are placed side by side
 FRAMES: Final = 150  # frames for fits of remedies
-FRAMES_FOR_ZEROS: Final = FRAMES // 3
 MIN_DRIFT: Final = (
     10.0  # [ms] between clocks, at once or over the log, from which they count as apart
 )
 CERTAIN: Final = 6.0  # [1] standard deviations from none that leave no doubt
-ZERO_SEARCHES: Final = 20  # random starts of the search for joint zeros
-ANGLES: Final = np.radians([-120, -90, -60, -30, 30, 60, 90, 120, 180, -10, 10]).tolist()
 PARTS: Final = 16  # parts of the log, between which the camera may have moved
 JUMP_RATIO: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
 
@@ -79,7 +77,7 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         found = _moved(log, model)
         if found:
             return found, None
-        other = identify(log, model, begin=_zeros(log, model))
+        other = identify(log, model, begin=searched(log, model))
         if _is_noise(log, other):
             robot = other
     found = _clocks(log, robot)
@@ -136,37 +134,6 @@ def _shares(log: Log, robot: Identified) -> FloatArray:
     """Return the errors of a feature over its motion, (m,)."""
     motion = np.std(log.features[robot.rows], axis=0).max()
     return np.asarray(np.sqrt(np.diag(robot.noise)) / motion)
-
-
-def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
-    """Return zeros of the joints, by a search along one after the other with the camera where it fits.
-
-    Searches from random zeros go on side by side, until none finds a smaller error any more.
-    """
-    rows = frames_of(log, FRAMES_FOR_ZEROS)
-    q = log.joints[rows]
-    y = log.features[rows]
-    n = log.spec.n
-    generator = np.random.default_rng(0)
-    zeros = generator.uniform(-math.pi, math.pi, (ZERO_SEARCHES, n))
-    errors = np.full(ZERO_SEARCHES, np.inf)
-    active = np.arange(ZERO_SEARCHES)
-    while active.size:
-        before = errors[active]
-        for joint in range(1, n - 1):  # the first and the last one turn camera and ball
-            tried = np.repeat(zeros[active, None], len(ANGLES), axis=1)
-            tried[..., joint] += ANGLES
-            _, found = fit_cameras(model, q + tried.reshape(-1, 1, n), y)
-            found = found.reshape(len(active), -1)
-            best = found.argmin(axis=1)
-            better = np.flatnonzero(found.min(axis=1) < errors[active])
-            zeros[active[better]] = tried[better, best[better]]
-            errors[active[better]] = found[better, best[better]]
-        active = active[errors[active] < before]
-    # Each zero within half a turn of none.
-    nearest = (zeros[errors.argmin()] + math.pi) % (2.0 * math.pi) - math.pi
-    names = [f"zero_{name}" for name in log.spec.joint_names]
-    return dict(zip(names, nearest.tolist(), strict=True))
 
 
 def _units(log: Log, model: RobotModel) -> str:

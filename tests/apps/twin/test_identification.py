@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from kit.nightly import some
 from kit.own import write
 from servobench import run
+from servobench.harness.apps.studies.challenge import find_challenge
 from servobench.harness.apps.twin import preflight
 from servobench.harness.apps.twin.drive import (
     Response,
@@ -689,6 +690,29 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
     assert text == ""
     assert robot.estimate("zero_elbow")[0] == pytest.approx(wanted[ELBOW], abs=0.05)
     assert abs(wanted[ELBOW]) > 1.0
+
+
+@pytest.mark.slow
+def test_an_arm_far_from_the_nominal_one_is_found_by_the_search():
+    settings = {"random": {"duration": 60.0}, "Excite": {"swing": 0.25}}
+    words = find_challenge("unknown_arm").mismatch
+    made = run(
+        "docs/examples/excite.py", task="random", mismatch=words, seed=88702, settings=settings
+    )
+    request = RunRequest("kinematic", "constant", "random", Mismatch.parse(words), 88702)
+    model = find_robot("ur5").nominal
+    log = read_log(logged()[0].spec, made.steps)
+
+    def error(robot):
+        true = draw_robot(request)[0]
+        q = log.joints[::100]
+        wanted = true.jacobian(q)
+        return np.linalg.norm(robot.model(model).jacobian(q) - wanted) / np.linalg.norm(wanted)
+
+    assert error(identify(log, model)) > 0.1
+    text, robot = mistakes(log, model)
+    assert text == ""
+    assert error(robot) < 0.01
 
 
 def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path, monkeypatch):
