@@ -30,13 +30,16 @@ TOPICS: Final = (
 KEYS: Final = ("run_id", "step", "time_s")  # columns that say where a row belongs
 
 
-def export_folder(folder: ResultsFolder, out: Path, kind: str) -> list[Path]:
-    """Write the steps of every run of a results folder into a file of its own.
+def export_folder(
+    folder: ResultsFolder, out: Path, kind: str, runs: pd.DataFrame | None = None
+) -> list[Path]:
+    """Write the steps of runs of a results folder into a file each.
 
     Args:
         folder: a results folder.
         out: new folder for the files; CSV also has the table of runs, `runs.csv`.
         kind: of `FORMATS`.
+        runs: rows of the table of runs; None for all.
 
     Returns:
         The files.
@@ -48,7 +51,8 @@ def export_folder(folder: ResultsFolder, out: Path, kind: str) -> list[Path]:
         raise ConfigurationError(f"format must be one of {', '.join(FORMATS)}, got {kind!r}")
     if kind == MCAP:
         check_installed((MCAP,), "the format mcap")
-    runs = folder.runs()
+    if runs is None:
+        runs = folder.runs()
     folder.check_steps()
     with accessing(out):
         if out.exists():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
+from servobench.harness.cli.selection import split_names
 from servobench.harness.cli.terminal import (
     FAILED,
     print_json,
@@ -130,14 +131,27 @@ def export(
         str,
         named_option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap)."),
     ] = "csv",
+    run: Annotated[
+        str | None, named_option("--run", "RUN_ID", "One run alone; default: all.")
+    ] = None,
+    controllers: Annotated[
+        str, option("NAMES", "Comma-separated names; default: all of the folder.")
+    ] = "all",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
     from servobench.harness.analysis.exports import export_folder
+    from servobench.harness.batch.logs import find_run
     from servobench.harness.batch.results import ResultsFolder
 
     opened = ResultsFolder(folder)
+    runs = opened.runs()
+    if run is not None:
+        chosen = find_run(opened, run)["run_id"]
+        runs = runs[runs["run_id"] == chosen]
+    known = list(dict.fromkeys(runs["controller"]))
+    runs = runs[runs["controller"].isin(split_names("controllers", controllers, known))]
     say(opened.describe_missing())
-    files = export_folder(opened, out, format_)
+    files = export_folder(opened, out, format_, runs)
     say(f"{len(files)} files in {out}")
 
 

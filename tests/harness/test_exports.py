@@ -74,3 +74,18 @@ def test_what_cannot_be_exported_is_one_line(folder, tmp_path):
         export_folder(ResultsFolder(folder), tmp_path / "xls", "xls")
     with pytest.raises(ConfigurationError, match="exists already; name a new folder"):
         export_folder(ResultsFolder(folder), tmp_path, "csv")
+
+
+def test_runs_and_controllers_are_chosen(folder, tmp_path, output_of, refusal_of):
+    def exported(name, *words):
+        output_of("export", folder, "--out", tmp_path / name, *words)
+        return sorted(path.stem for path in (tmp_path / name).iterdir())
+
+    run_id = load(folder).runs["run_id"].iloc[0]
+    assert exported("one", "--run", run_id) == sorted([run_id, "runs"])
+    broyden = exported("some", "--controllers", "broyden")
+    assert len(broyden) == 2
+    assert pd.read_csv(tmp_path / "some" / "runs.csv")["controller"].tolist() == ["broyden"]
+    unknown = refusal_of("export", folder, "--out", tmp_path / "none", "--run", "mine")
+    assert "has no run 'mine'" in unknown
+    assert not (tmp_path / "none").exists()

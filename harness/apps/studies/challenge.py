@@ -98,7 +98,7 @@ class Challenge:
     mismatch: str = "moderate"
     measure: Literal["settling", "later", "path"] = "settling"
     reference: Names = ()
-    plants: Names = ("kinematic", "fmu")
+    plants: Names = ("kinematic",)
     camera: str = ""
     period: Positive | None = None
     latency: NonNegative | None = None
