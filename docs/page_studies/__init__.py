@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from page_studies.calibration_errors import CALIBRATION_ERRORS
 from page_studies.claims import CLAIMS, CLAIMS_ENGINES, LAB
 from page_studies.failures import FAILURES
 from page_studies.held_out import AIDS, HELD_OUT, RENDERED_STUDY, TUNING_STUDIES
@@ -17,6 +18,6 @@ STUDIES = {
     for study in (
         CHALLENGES, HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, CLAIMS, CLAIMS_ENGINES, RATES_STUDY, LONG, ENDS,
         DYNAMICS, WORLDS, LAB, LEARNED, KNOWN_STUDY, LEARNING, PAIRS_STUDY, SENSING, MAP, MAP_ENGINES, README, FAILURES,
-        PERFORMANCE, *NOISE_STUDIES,
+        CALIBRATION_ERRORS, PERFORMANCE, *NOISE_STUDIES,
     )
 }  # fmt: skip
