@@ -30,7 +30,7 @@ CALIBRATES: Final = "calibrating_mfac"
 SEEDS: Final = "930950:930990"
 # Axis of the mismatch -> its title, unit and magnitudes
 AXES: Final[Mapping[str, tuple[str, str, tuple[float, ...]]]] = {
-    "camera_rotation": ("camera turned by", "deg", (0.5, 1.0, 2.0, 3.0, 10.0, 30.0, 90.0)),
+    "camera_rotation": ("camera turned by", "deg", (0.5, 1.0, 2.0, 3.0, 10.0, 30.0, 60.0, 90.0)),
     "joint_offsets": ("joint zeros within ±", "deg", (0.1, 0.5, 1.0, 3.0, 10.0, 30.0)),
     "links": ("links within ±", "%", (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)),
     "tool": ("tool within ±", "mm", (5.0, 10.0, 30.0, 100.0)),
@@ -44,6 +44,12 @@ METHODS: Final = {  # part of the study and name there -> title
     ("learning", SERVOES): f"`{SERVOES}`",
     ("learning", CALIBRATES): f"`{CALIBRATES}`",
 }
+ON_CURVES: Final = {
+    ("curves_kept", SERVOES): "servo with the calibration",
+    ("curves", SERVOES): f"`{SERVOES}`",
+    ("curves", CALIBRATES): f"`{CALIBRATES}`",
+}
+KEPT: Final = settings((f"{SERVOES}.aids.model=nominal",))  # the calibration is not learned from
 COLOURS: Final = ("0.2", "tab:orange", "tab:blue", "tab:green")
 BAND: Final = 5.0  # [mm] settling band
 
@@ -70,10 +76,16 @@ def mismatches() -> dict[str, str]:
     return found
 
 
-def command(controllers: tuple[str, ...], *options: str) -> Words:
-    """Return the arguments of the sweep of methods over all errors."""
+def moves(controllers: tuple[str, ...], *options: str) -> Words:
+    """Return the arguments of the sweep of methods over all errors, on moves."""
     every = ",".join(mismatches())
     return sweep("kinematic", controllers, "random", SEEDS, "--mismatch", every, *options)
+
+
+def curves(controllers: tuple[str, ...], *options: str) -> Words:
+    """Return the arguments of the sweep of methods over errors of all axes together, on the circle."""
+    every = ",".join(("none", *map(together, FACTORS)))
+    return sweep("kinematic", controllers, "circle", SEEDS, "--mismatch", every, *options)
 
 
 def reached(runs: pd.DataFrame) -> str:
@@ -82,31 +94,42 @@ def reached(runs: pd.DataFrame) -> str:
     return f"{error}, {settled_share(runs).value:.0f} %"
 
 
-def _runs(folder: Path) -> dict[str, pd.DataFrame]:
+def _runs(folder: Path, methods: Mapping[tuple[str, str], str]) -> dict[str, pd.DataFrame]:
     """Return the runs of each method by its title."""
-    parts = {part: load_runs(folder / part) for part, _ in METHODS}
+    parts = {part: load_runs(folder / part) for part, _ in methods}
     found = {}
-    for (part, name), title in METHODS.items():
+    for (part, name), title in methods.items():
         runs = parts[part]
         found[title] = runs[runs["controller"] == name]
     return found
 
 
-def errors_table(folder: Path) -> dict[str, pd.DataFrame]:
+def _rows(
+    runs: Mapping[str, pd.DataFrame], titles: Mapping[str, str], cell: cells.Cell
+) -> pd.DataFrame:
     """Return what each method reaches with each error, a row an error."""
-    runs = _runs(folder)
     rows = []
-    for mismatch, title in mismatches().items():
+    for mismatch, title in titles.items():
         row = {"error of the calibration": title}
         for method, own in runs.items():
-            row[method] = reached(own[own["mismatch"] == mismatch])
+            row[method] = cell(own[own["mismatch"] == mismatch])
         rows.append(row)
-    return {"calibration_errors": pd.DataFrame(rows)}
+    return pd.DataFrame(rows)
+
+
+def errors_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return what each method reaches with each error on moves, and with those of all axes on the circle."""
+    titles = mismatches()
+    circle = {"none": "none"} | {each: titles[each] for each in map(together, FACTORS)}
+    return {
+        "calibration_errors": _rows(_runs(folder, METHODS), titles, reached),
+        "calibration_errors_circle": _rows(_runs(folder, ON_CURVES), circle, cells.millimetres),
+    }
 
 
 def errors_picture(folder: Path) -> dict[str, bytes]:
     """Return a picture of the error in the last second over the error of the calibration, a panel an axis."""
-    runs = _runs(folder)
+    runs = _runs(folder, METHODS)
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     panels = figure.subplots(1, len(AXES), sharey=True)
     for axes, (axis, (title, unit, magnitudes)) in zip(panels, AXES.items(), strict=True):
@@ -149,9 +172,11 @@ CALIBRATION_ERRORS = Study(
     "what errors of a calibration cost one who looks and then moves, and one who servoes: 40 robots",
     10,
     {
-        "learning": command((LOOKS, SERVOES, CALIBRATES)),
-        "kept": command((SERVOES,), *settings((f"{SERVOES}.aids.model=nominal",))),
+        "learning": moves((LOOKS, SERVOES, CALIBRATES)),
+        "kept": moves((SERVOES,), *KEPT),
+        "curves": curves((SERVOES, CALIBRATES)),
+        "curves_kept": curves((SERVOES,), *KEPT),
     },
-    errors_table,
+    errors_tables,
     errors_picture,
 )
