@@ -8,6 +8,7 @@ of methods, the study of the aids and the spaces of tuning are made from these d
 with some aids alone says so in its type, too: `Only`.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias
@@ -39,11 +40,26 @@ class Switch:
 
 @dataclass(frozen=True)
 class Tuned:
-    """Declares the range in which a number is tuned."""
+    """Declares the range in which a number is tuned, in the type of its field.
+
+        gain: Annotated[float, Tuned(1.0, 20.0, log=True)] = 3.0
+
+    Raises:
+        ValueError: the range is not two numbers, is empty, or reaches 0 where it is searched by factor.
+    """
 
     low: float  # smallest value
     high: float  # largest value
     log: bool = False  # whether it is searched by factor
+
+    def __post_init__(self) -> None:
+        """Refuse a range that cannot be searched."""
+        numbers = isinstance(self.low, int | float) and isinstance(self.high, int | float)
+        fit = numbers and -math.inf < self.low < self.high < math.inf
+        if not fit or (self.log and self.low <= 0.0):
+            raise ValueError(
+                f"wanted two finite numbers, the lower one first, and above 0 with log=True; got {self}"
+            )
 
 
 @settings

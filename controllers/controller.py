@@ -10,7 +10,7 @@ derives from `Controller`.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -166,6 +166,7 @@ class ControllerEntry:
         build: makes the controller from its settings and its knowledge of the robot.
         needs_truth: whether it is given the true Jacobian and kinematics: a bound, not a competitor.
         side_by_side: whether `build` returns a `ServoController`, whose parts take many runs at once.
+        tuned: tuned values, nested, that replace defaults; of a controller of a user, from the file beside its code.
     """
 
     name: str
@@ -174,3 +175,4 @@ class ControllerEntry:
     build: Callable[[Any, RobotKnowledge], Controller]
     needs_truth: bool = False
     side_by_side: bool = False
+    tuned: Mapping[str, Any] = field(default_factory=dict, compare=False)

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from servobench.controllers.aids import EQUIPPED
+    from servobench.controllers.aids import EQUIPPED, Tuned
     from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
     from servobench.harness.apps.check.controllers import check_controller
     from servobench.harness.apps.check.plants import check_plant
@@ -39,6 +39,7 @@ __all__ = [
     "TaskEntry",
     "TaskSetting",
     "Truth",
+    "Tuned",
     "World",
     "check_controller",
     "check_plant",
@@ -48,7 +49,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "servobench.controllers.aids": ("EQUIPPED",),
+    "servobench.controllers.aids": ("EQUIPPED", "Tuned"),
     "servobench.controllers.controller": ("Controller", "ControllerEntry", "RobotKnowledge"),
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.apps.check.controllers": ("check_controller",),

@@ -64,6 +64,7 @@ def describe_batch(
     given: dict[str, dict[str, Any]] = {key: {} for key in OWN.values()}
     for offer in own:
         given[OWN[offer.word]][offer.name] = offer.record()
+    tuned = {offer.name: offer.tuned for offer in own if offer.tuned}
     engines = {}
     for name in runs.plants:
         plant = find_plant(name)
@@ -74,6 +75,7 @@ def describe_batch(
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
         **given,
+        "tuned": tuned,
         "plugins": dict(plugins(runs)),
         "files": named_files(runs, configuration, own),
         "tasks": list(runs.tasks),

@@ -20,6 +20,7 @@ from typing import Any, Final, Generic, Self, TypeVar, overload
 import numpy as np
 
 from servobench.harness.config.registry import find_plant
+from servobench.harness.config.settings import TUNING, TUNING_WORDS
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.variations import SHORT_NAMES, Value, Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -34,8 +35,6 @@ DEFAULT_MISMATCH: Final = "moderate"  # On plants with robots of their own it st
 MAX_SEEDS: Final = 1_000_000  # seeds of a batch
 MAX_SEED: Final = 2**63 - 1  # which the tables hold
 MAX_SHOWN: Final = 200  # [characters] length of a given text in a message
-TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
-TUNING_WORDS: Final = f"{TUNING.start}:{TUNING.stop}"
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import contextlib
 import hashlib
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -23,8 +23,10 @@ import numpy as np
 
 from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.harness.config.settings import read_tuned
 from servobench.harness.config.source import (
     SourceFile,
+    code_digest,
     describe_at,
     digest_of_module,
     find_place,
@@ -415,6 +417,10 @@ class Own(Generic[Entry]):
     file: str = ""  # path of the code; empty for code that was typed into an interpreter
     digest: str = ""  # SHA-256 of the code; empty where it cannot be read
     given: bool = False  # whether it was given as an object in Python
+    code: str = ""  # SHA-256 of the code and the modules beside it; empty where no file holds it
+    tuned_path: Path = Path()  # the file of its tuned values, beside its code
+    # Content of that file; empty for a controller that is not tuned
+    tuned: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     @property
     def name(self) -> str:
@@ -446,9 +452,9 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
         source, module = None, import_user_module(found["module"])
         given = _pick(kind, module, found["module"], found["attribute"])
         file, digest = Path(module.__file__ or found["module"]), digest_of_module(found["module"])
-    return Own(
-        kind.word, kind.make_entry(given, place, found["alias"]), place, source, str(file), digest
-    )
+    entry = kind.make_entry(given, place, found["alias"])
+    own = Own(kind.word, entry, place, source, str(file), digest)
+    return _with_tuned_values(own, getattr(given, "__name__", None) or entry.name)
 
 
 def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
@@ -465,7 +471,27 @@ def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
     except (OSError, TypeError):  # typed into an interpreter
         return Own(kind.word, entry, built.__qualname__, given=True)
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return Own(kind.word, entry, built.__qualname__, None, file, digest, given=True)
+    own = Own(kind.word, entry, built.__qualname__, None, file, digest, given=True)
+    if isinstance(given, kind.bases):  # an object that is built already has no settings
+        return own
+    return _with_tuned_values(own, entry.name)
+
+
+def _with_tuned_values(own: Own[Any], name: str) -> Own[Any]:
+    """Return a controller with the tuned values that lie beside its code, if there are any of this version of it.
+
+    Args:
+        own: anything of a user.
+        name: of it in its code.
+    """
+    file = Path(own.file)
+    if own.word != CONTROLLER.word or not file.is_file():
+        return own
+    path = file.with_name(f"{file.stem}.{name}.tuned.toml")
+    code = code_digest(file)
+    tuned = read_tuned(path, own.entry, own.place, code)
+    entry = replace(own.entry, tuned=tuned.get("settings", {}))
+    return replace(own, entry=entry, code=code, tuned_path=path, tuned=tuned)
 
 
 def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> object:

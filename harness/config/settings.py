@@ -5,9 +5,10 @@ nested with dots. Nothing else is read from the files, and an unknown section or
 commands, so it may have sections that do not run; an assignment is meant for one, and must have an effect there.
 
 The defaults of a controller are those of its class with the tuned values on top, the table `[settings]` of a file
-`controllers/tuned/NAME.toml` that `servobench tune` wrote, with a dot for a colon in the name. They are tuned for arms
-of which a nominal model is known, where an estimator learns the difference from it. On an arm without one the estimator
-has the whole Jacobian to learn, and to find the first one by probing moves.
+`controllers/tuned/NAME.toml` that `servobench tune` wrote, with a dot for a colon in the name. Those of a class `Mine`
+of a user's `mine.py` lie beside it, in `mine.Mine.tuned.toml`, and are taken while the code is that which was tuned.
+Ours are tuned for arms of which a nominal model is known, where an estimator learns the difference from it. On an arm
+without one the estimator has the whole Jacobian to learn, and to find the first one by probing moves.
 """
 
 import contextlib
@@ -21,11 +22,14 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
+from servobench.harness.config.source import show
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import is_file, parse_toml, read_toml
-from servobench.plant.contract.settings import override
+from servobench.plant.contract.settings import override, remark
 
 Config = TypeVar("Config")
+TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
+TUNING_WORDS: Final = f"{TUNING.start}:{TUNING.stop}"
 # Assignment to a plant called as its file
 MAPPED: Final = re.compile(r"\s*(fmu:.+?\.(?i:toml))\.(.+)", re.DOTALL)
 
@@ -204,7 +208,7 @@ def default_config(entry: ControllerEntry, *, model_known: bool = True) -> Any: 
     Raises:
         ConfigurationError: a file of tuned values that is malformed or does not fit the configuration.
     """
-    tuned = tuned_settings(entry.name)
+    tuned = entry.tuned or tuned_settings(entry.name)
     return apply_settings(entry, tuned if model_known else _without_model(entry, tuned))
 
 
@@ -243,4 +247,34 @@ def tuned_settings(name: str) -> Mapping[str, Any]:
         ) from error
     if not isinstance(values, dict):
         raise ConfigurationError(f"tuned values {file}: [settings] must be a table, got {values!r}")
+    return values
+
+
+def read_tuned(path: Path, entry: ControllerEntry, place: str, code: str) -> Mapping[str, Any]:
+    """Return the content of a file of tuned values; empty where there is none, or where the code was edited since.
+
+    Args:
+        path: of the file.
+        entry: of the controller.
+        place: of its code, for messages.
+        code: digest of its code.
+
+    Raises:
+        ConfigurationError: it cannot be read, its values do not fit, or its robots are not those kept for tuning.
+    """
+    if not path.is_file():
+        return {}
+    values = read_toml("tuned values", path)
+    if values.get("sha256") != code:
+        remark(
+            f"{place} was edited after {show(path)} was made: it is not tuned and has its default values"
+        )
+        return {}
+    place = f"tuned values {show(path)}, which servobench tune makes: "
+    with configuration_errors(place, AttributeError, KeyError, TypeError):
+        for seeds in values["seeds"]:
+            begin, end = map(int, seeds.split(":"))
+            if begin not in TUNING or end - 1 not in TUNING:
+                raise ValueError(f"robots {seeds} may judge, only {TUNING_WORDS} are for tuning")
+        apply_settings(entry, values["settings"])
     return values

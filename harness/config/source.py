@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, Self, TypeAlias
 
+from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import is_file, reason, user_path
 from servobench.plant.contract.settings import suggest
@@ -306,6 +307,12 @@ def neighbours(file: Path, root: Path) -> list[Path]:
     return sorted(
         {path for _, _, name in traced_imports(file, root) for path in _files(root, name)} - {file}
     )
+
+
+def code_digest(file: Path) -> str:
+    """Return one SHA-256 of a file of code and the modules that it imports from its folder; it holds no path."""
+    digests = [digest(path) for path in (file, *neighbours(file, file.parent))]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def traced_imports(file: Path, root: Path) -> Iterator[tuple[Path, int, Name]]:

@@ -63,5 +63,5 @@ def read_tuned(path):
     """Return the contents of a file of tuned values."""
     data = tomllib.loads(path.read_text(encoding="utf-8"))
     studies = tuple(StudyRecord(**record) for record in data["studies"])
-    lists = {key: tuple(data[key]) for key in ("plants", "edges") if key in data}
+    lists = {key: tuple(data[key]) for key in ("plants", "edges", "seeds") if key in data}
     return TunedValues(**{**data, **lists, "studies": studies})

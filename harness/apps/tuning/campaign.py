@@ -49,9 +49,11 @@ from servobench.harness.apps.tuning.spaces import (
 from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.config.description import toml
+from servobench.harness.config.installation import read_checkout
+from servobench.harness.config.registry import offered
 from servobench.harness.config.settings import default_config, file_stem, flatten
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.files import accessing, write_atomically
 from servobench.plant.contract.settings import Count, Periods, settings
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
@@ -178,8 +180,10 @@ class Method:
         second_of_defaults = self.second.costs(self._default)
         if own is None or of_defaults is None or second_of_defaults is None:
             return None
-        runs = self._plan.runs
+        plan = self._plan
+        runs = plan.runs
         checked = runs.checked()
+        seeds = runs.seeds(), runs.second().seeds()
         records = [
             replace(each, second_score=second)
             for each, second in zip(outcomes, second_scores, strict=False)
@@ -191,6 +195,10 @@ class Method:
             runs_of_second_set=len(second_of_defaults),
             date=datetime.now(UTC).date().isoformat(),
             version=version("servobench"),
+            commit=read_checkout()[0] or "unknown",
+            seeds=seeds,
+            budget=f"{plan.studies} × {plan.trials} trials, {plan.search} by search, on robots {' and '.join(seeds)}",
+            sha256="".join(own.code for own in offered([self.name])),
             score=score(own),
             score_of_defaults=score(of_defaults),
             second_score=min(second_scores),
@@ -253,9 +261,10 @@ def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> It
 
 
 def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, TunedValues]:
-    """Return the results of every method whose studies are finished by its name, and write them, `NAME.toml`.
+    """Return the results of every method whose studies are finished by its name, and write them.
 
-    Results without a run that ended well are of no use and not written.
+    Those of a controller of the user go beside its code, those of the others into the folder, `NAME.toml`. Results
+    without a run that ended well are of no use and not written.
     """
     results = {}
     for method in methods:
@@ -263,8 +272,11 @@ def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, Tuned
         if tuned is not None:
             results[method.name] = tuned
     for name, tuned in results.items():
+        path = folder / f"{file_stem(name)}.toml"
+        for own in offered([name]):
+            path = own.tuned_path
         if not tuned.lost:
-            write_tuned(folder / f"{file_stem(name)}.toml", tuned)
+            write_tuned(path, tuned)
     return results
 
 
@@ -291,6 +303,11 @@ class TunedValues:
     studies: tuple[StudyRecord, ...]
     # A line for each number at an edge of its box, which is wider in the next study
     edges: tuple[str, ...] = ()
+    seeds: tuple[str, ...] = ()  # robots of the trials and of the second set
+    # Studies × trials, the most points of the search in each study, and the seeds
+    budget: str = ""
+    commit: str = "unknown"  # servobench's
+    sha256: str = ""  # a user's code; empty for a controller of this package
 
     @property
     def lost(self) -> bool:
@@ -318,7 +335,8 @@ def write_tuned(path: Path, tuned: TunedValues) -> None:
     text = HEADING + _table(values)
     for record in records:
         text += _table(record, "studies.", "\n[[studies]]\n")
-    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+    with accessing(path, "tuned values"):
+        write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:

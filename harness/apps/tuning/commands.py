@@ -66,13 +66,11 @@ def tune(
         write_results,
     )
     from servobench.harness.apps.tuning.objective import TuningSet
-    from servobench.harness.apps.tuning.spaces import SPACES, find_tunable
+    from servobench.harness.apps.tuning.spaces import SPACES, choose_tunable
     from servobench.harness.batch.blocks import open_workers
     from servobench.harness.batch.lock import locked
 
-    names = selection.split_names(
-        "controllers", controllers, tuple(SPACES), selection.accepted(find_tunable)
-    )
+    names = selection.split_names("controllers", controllers, tuple(SPACES), choose_tunable)
     with configuration_errors():
         runs = TuningSet(selection.split("plants", plants), robots, offset)
         second = runs.second()
@@ -94,7 +92,10 @@ def tune(
         _print_tuned(results)
     lost = [name for name, tuned in results.items() if tuned.lost]
     if len(results) > len(lost):
-        say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
+        say(
+            f"studies and tuned values in {out}; copy its .toml files to controllers/tuned; "
+            "those of your controllers lie beside their code and are taken from now on"
+        )
     if interrupt is not None:
         _end_interrupted(out)
     if lost:
@@ -198,4 +199,4 @@ def _print_tuned(results: Mapping[str, TunedValues]) -> None:
     )
     for name, tuned in results.items():
         for edge in tuned.edges:
-            say(f"{name}: {edge}; with these values in use the next study searches a wider box")
+            say(f"{name}: {edge}; a wider one may hold better values")

@@ -37,9 +37,15 @@ from servobench.harness.apps.tuning.spaces import find_tunable
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.manifest import named_files, plugins
-from servobench.harness.batch.plan import TUNING, Cell, Survey, tuning_seeds
+from servobench.harness.batch.plan import Cell, Survey, tuning_seeds
 from servobench.harness.config.registry import find_plant, offered
-from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
+from servobench.harness.config.settings import (
+    TUNING,
+    Settings,
+    apply_settings,
+    file_stem,
+    flatten,
+)
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -167,6 +173,11 @@ class TuningSet:
             )
         return replace(self, robots=SECOND_FACTOR * self.robots, offset=offset)
 
+    def seeds(self) -> str:
+        """Return the seeds of the runs, the end not included."""
+        first = TUNING[self.offset]
+        return f"{first}:{first + len(KINDS) * self.robots}"
+
     def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a world one after the other."""
         return list(_runs_of(self))
@@ -274,7 +285,7 @@ def evaluate(
         for t, r, run in alike:
             jobs.append(Job(len(jobs), Cell(run.request), run, kind))
             places.append((t, r))
-    own = offered(dict.fromkeys(run.plant for run in runs))
+    own = offered([*(run.plant for run in runs), *(trial.controller for trial in trials)])
     blocks = cut(jobs, even_size(len(jobs), workers.count), 1, own)
     for block, outcome in carry_out_blocks(blocks, workers):
         for job, result in zip(block.jobs, outcome, strict=True):
@@ -385,6 +396,8 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
         "plants": [*runs.plants, *files.values(), *code],
         "robots": [runs.robots, runs.offset],
     }
+    for own in offered([controller]):
+        fingerprint["code of the controller"] = own.code
     return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint)
 
 
@@ -429,9 +442,9 @@ def bears_delay(trial: Trial) -> bool:
     """Return whether the loop of a composed controller has the least delay margin, `MIN_DELAY_MARGIN`.
 
     A controller that identifies the delay changes its loop with it and is left to the runs; so is one whose loop cannot
-    be analysed.
+    be analysed, and one of a user.
     """
-    if trial.config.aids.delay == "identified":
+    if offered([trial.controller]) or trial.config.aids.delay == "identified":
         return True
     try:
         return delay_margin(trial.config, trial.controller) >= MIN_DELAY_MARGIN

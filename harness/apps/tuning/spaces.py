@@ -25,7 +25,7 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 import math
 import warnings
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -35,13 +35,14 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from optuna.exceptions import ExperimentalWarning
 from optuna.samplers import TPESampler
 
-from servobench.controllers.aids import RANGES, SWITCHES
+from servobench.controllers.aids import RANGES, SWITCHES, Switch, Tuned
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.config.registry import find_controller
+from servobench.harness.config.registry import choose_controller, find_controller, offered
 from servobench.harness.config.settings import apply_settings, flatten, nest, tuned_settings
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.dependence import declared
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.seeds import named_seed
-from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.settings import check_field, suggest
 
 Distribution: TypeAlias = CategoricalDistribution | FloatDistribution | IntDistribution
 Space: TypeAlias = Mapping[str, Distribution]
@@ -160,26 +161,85 @@ SPACES: Final[Mapping[str, Space]] = {
 }
 
 
+def choose_tunable(word: str) -> str:
+    """Return the name of a controller that has a search space, given its name or the place of a user's.
+
+    Raises:
+        ConfigurationError: as `find_space`, or code that cannot be used.
+    """
+    name = choose_controller(word)
+    with configuration_errors("", NameError):  # types of settings are code of the user
+        find_space(name)
+    return name
+
+
 def find_tunable(name: str) -> ControllerEntry:
-    """Return the entry of a controller that has a search space; code of users, which has none, is not imported.
+    """Return the entry of a controller that has a search space.
 
     Raises:
         ConfigurationError: an unknown controller, or one without a space.
     """
-    if name not in SPACES:
+    if name not in SPACES and not offered([name]):
         raise ConfigurationError(f"controller {name} has no search space: {suggest(name, SPACES)}")
     return find_controller(name)
 
 
 def find_space(name: str) -> Space:
-    """Return the search space of a controller, its switches first and its boxes widened around the values in use.
+    """Return the search space of a controller, its switches first.
+
+    Boxes of this package's are widened around the values in use; a user knows how far his own may reach.
 
     Raises:
         ConfigurationError: an unknown controller, or one without a space.
     """
-    find_tunable(name)
-    space = widened(SPACES[name], flatten(tuned_settings(name)))
+    entry = find_tunable(name)
+    if name in SPACES:
+        space = widened(SPACES[name], flatten(tuned_settings(name)))
+    else:
+        space = declared_space(name, entry.config())
+    if not space:
+        raise ConfigurationError(
+            f"controller {name} declares no range: write for instance gain: Annotated[float, servobench.Tuned(1, 20)] "
+            "= 3.0 in the dataclass of its settings"
+        )
     return {**_switches(space), **space}
+
+
+def declared_space(name: str, config: Any) -> Space:  # noqa: ANN401 - any configuration dataclass
+    """Return the search space that the types of settings declare: ranges of numbers, and aids that are switched on.
+
+    Args:
+        name: of the section, for messages.
+        config: the default settings.
+
+    Raises:
+        ValueError: a range without the default, or one that the type of its field refuses.
+    """
+    kind: Any = type(config)
+    ranges = declared(kind, Tuned)
+    switches = declared(kind, Switch)
+    space: dict[str, Distribution] = {}
+    for field in fields(config):
+        key = field.name
+        value = getattr(config, key)
+        if is_dataclass(value):
+            inner = declared_space(f"{name}.{key}", value)
+            space |= {f"{key}.{each}": box for each, box in inner.items()}
+        elif key in switches and switches[key].tuned and value != field.default:
+            space[key] = CategoricalDistribution(switches[key].tuned)
+        elif key in ranges:
+            space[key] = _declared_box(f"{name}.{key}", kind, key, value, ranges[key])
+    return space
+
+
+def _declared_box(name: str, kind: type, key: str, default: Any, given: Tuned) -> Distribution:  # noqa: ANN401 - any setting
+    """Return the range of a field of a settings class; a ValueError if it does not fit the field."""
+    if type(default) not in (int, float) or not given.low <= default <= given.high:
+        raise ValueError(f"{name}: {given} must hold the default, a number; it is {default!r}")
+    low, high = (check_field(name, kind, key, end) for end in (given.low, given.high))
+    if type(low) is int:
+        return IntDistribution(low, high, log=given.log)
+    return FloatDistribution(low, high, log=given.log)
 
 
 def _switches(space: Space) -> Space:
@@ -380,7 +440,8 @@ def first_points(name: str) -> list[Point]:
     """Return the points that every study of a controller tries first, each once.
 
     They are the defaults of its class, the tuned values in use, the defaults with each value of each switch, and the
-    tuned values with those of other methods for the keys that both have.
+    tuned values with those of other methods for the keys that both have; of a user's, whose settings may have the names
+    of ours and another meaning, for the aids alone.
     """
     entry = find_tunable(name)
     space = find_space(name)
@@ -388,9 +449,10 @@ def first_points(name: str) -> list[Point]:
     own = tuned_point(entry)
     flips = [point for _, point in neighbours(_switches(space), default)]
     points = [default, own, *flips]
+    common = [key for key in space if name in SPACES or key.startswith("aids.")]
     for other in SPACES:
         tuned = flatten(tuned_settings(other))
-        shared = {key: value for key, value in tuned.items() if key in space}
+        shared = {key: tuned[key] for key in common if key in tuned}
         if shared and other != name:
             points.append(inside(space, {**own, **shared}, own))
     return list({str(nested_settings(point)): point for point in points}.values())
@@ -399,7 +461,7 @@ def first_points(name: str) -> list[Point]:
 def tuned_point(entry: ControllerEntry) -> Point:
     """Return the tuned values in use as a point of the controller's space; the defaults if there are none that fit."""
     default = default_values(entry)
-    settings = tuned_settings(entry.name)
+    settings = entry.tuned or tuned_settings(entry.name)
     if not settings:
         return default
     try:

@@ -25,27 +25,7 @@ SHORT = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def _short_runs(monkeypatch):
-    short = {
-        "random": {"duration": 0.5},
-        "circle": {"lap_time": 1.0},
-        "lemniscate": {"lap_time": 1.0},
-    }
-    monkeypatch.setattr(
-        objective, "TASKS", {name: task | short[name] for name, task in objective.TASKS.items()}
-    )
-    monkeypatch.setattr(objective, "SECOND_FACTOR", 1)  # instead of three times the runs of a trial
-
-
-def test_code_of_users_has_no_search_space_and_is_not_imported(refusal_of, tmp_path):
-    (tmp_path / "mine.py").write_text(
-        "import pathlib\n\npathlib.Path(__file__).with_name('imported').touch()\n"
-    )
-    place = f"{tmp_path / 'mine.py'}:Mine"
-    line = refusal_of("tune", "--controllers", place, "--out", tmp_path / "out")
-    assert line.startswith(f"servobench: controller {place} has no search space: valid: ")
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(
