@@ -6,15 +6,18 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.controllers.aids import describe_aids
-from servobench.harness.analysis.comparison import FROM_TWIN, shown_value
+from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
 from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.config.registry import MAPPED
+from servobench.harness.config.registry import CONTROLLERS, MAPPED
+from servobench.harness.config.settings import tuned_settings
+from servobench.harness.config.source import find_place
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.settings import listed
 
 # Columns, with settings that are varied
 DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")
+TUNED: Final = "†"  # mark of a controller that a user tuned
 
 
 def describe_folder(manifest: Mapping[str, Any], runs: pd.DataFrame) -> dict[str, str]:
@@ -65,6 +68,44 @@ def describe_controllers(manifest: Mapping[str, Any]) -> str:
         words = describe_aids(values) if known else "aids unknown"
         found.setdefault(words, []).append(name)
     return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
+
+
+def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> list[str]:
+    """Return a line for each controller that its user tuned, with budget and robots, and one about those not tuned.
+
+    The latter only where others are tuned. Bounds, which know the true robot, and FMUs, whose values nobody knows, are
+    left out.
+
+    Args:
+        manifest: of a folder.
+        command: also name the command that tunes a user's controllers.
+    """
+    tuned = manifest.get("tuned", {})
+    own = manifest.get("own_controllers", {})
+    names = manifest.get("controllers", ())
+    lines = [f"{TUNED} {name} was tuned: {facts.get('budget')}" for name, facts in tuned.items()]
+    known = {name for name in names if name in CONTROLLERS and tuned_settings(name)} | tuned.keys()
+    untuned = []
+    places = []
+    for name in names:
+        place = own.get(name, {}).get("place", name)
+        if name in known or knows_truth(name) or place.startswith(MAPPED):
+            continue
+        untuned.append(name)
+        if name in own and find_place(place):
+            places.append(place)
+    if not known or not untuned:
+        return lines
+    line = f"Not tuned, unlike the others: {', '.join(untuned)}"
+    if places and command:
+        line += f"; remedy: servobench tune --controllers {','.join(places)}"
+    return [*lines, line]
+
+
+def mark_tuned(runs: pd.DataFrame, manifest: Mapping[str, Any]) -> pd.DataFrame:
+    """Return runs for tables, in which controllers that their user tuned have a mark, see `describe_tuning`."""
+    marks = {name: f"{name} {TUNED}" for name in manifest.get("tuned", {})}
+    return runs.replace({"controller": marks})
 
 
 def describe_settings(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:

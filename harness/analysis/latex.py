@@ -7,7 +7,11 @@ from typing import Any, Final
 
 import pandas as pd
 
-from servobench.harness.analysis.folder import describe_controllers, describe_folder
+from servobench.harness.analysis.folder import (
+    describe_controllers,
+    describe_folder,
+    describe_tuning,
+)
 from servobench.harness.analysis.tables import PAIR, Tables
 from servobench.harness.run.variations import varied_columns
 
@@ -22,6 +26,7 @@ SIGNS: Final = str.maketrans(
         "–": "--",
         "−": "$-$",
         "×": r"$\times$",
+        "†": r"$^\dagger$",
         "µ": r"$\mu$",
         "²": "$^2$",
         "³": "$^3$",
@@ -101,6 +106,7 @@ def methods_paragraph(manifest: Mapping[str, Any], runs: pd.DataFrame) -> str:
     sentences = [
         _combinations(manifest, facts),
         *_aids(manifest),
+        *describe_tuning(manifest, command=False),
         *_varied(facts, runs),
         _robots(facts, runs),
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",

@@ -50,7 +50,12 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.folder import describe_controllers, titled_runs
+    from servobench.harness.analysis.folder import (
+        describe_controllers,
+        describe_tuning,
+        mark_tuned,
+        titled_runs,
+    )
     from servobench.harness.analysis.latex import latex_tables, methods_paragraph
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch.results import ResultsFolder
@@ -72,7 +77,7 @@ def statistics(
         print_json(found)
         return
     say(f"% {missing}" if latex and missing else missing)
-    tables = statistics_tables(runs, metric)
+    tables = statistics_tables(mark_tuned(runs, opened.manifest), metric)
     if latex:
         say("\n\n".join([*latex_tables(tables), methods_paragraph(opened.manifest, runs)]))
         return
@@ -81,6 +86,7 @@ def statistics(
     else:
         print_tables(tables)
     say(describe_controllers(opened.manifest))
+    say("\n".join(describe_tuning(opened.manifest)))
 
 
 def collect(

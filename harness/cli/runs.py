@@ -162,7 +162,11 @@ def sweep(
     No steps are kept. A sweep that was interrupted is continued with --resume.
     """
     from servobench.harness.analysis.comparison import MISSING
-    from servobench.harness.analysis.folder import describe_controllers
+    from servobench.harness.analysis.folder import (
+        describe_controllers,
+        describe_tuning,
+        mark_tuned,
+    )
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, outcome_legend, sweep_tables
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.plan import SweepPlan
@@ -185,8 +189,10 @@ def sweep(
     folder = ResultsFolder(out)
     outcomes = outcome_legend(folder.iterate_runs(columns))
     legend = f"{outcomes}\n{MISSING} as configured".lstrip()
-    print_tables(sweep_tables(folder.iterate_runs(columns)), legend)
+    parts = (mark_tuned(part, folder.manifest) for part in folder.iterate_runs(columns))
+    print_tables(sweep_tables(parts), legend)
     say(describe_controllers(folder.manifest))
+    say("\n".join(describe_tuning(folder.manifest)))
     say(f"table in {out / RUNS}")
     judge(folder, strict=running.strict, whole=execution.part == (1, 1))
 
@@ -257,7 +263,12 @@ def _carry_out(
     strict: bool,
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
-    from servobench.harness.analysis.folder import describe_controllers, titled_runs
+    from servobench.harness.analysis.folder import (
+        describe_controllers,
+        describe_tuning,
+        mark_tuned,
+        titled_runs,
+    )
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.batch.results import ResultsFolder
@@ -269,8 +280,10 @@ def _carry_out(
         carry_out(campaign, folder, watched)
         opened = ResultsFolder(folder)
         runs = titled_runs(opened)
-        print_tables(summary_tables(runs), summary_legend(runs))
+        shown = mark_tuned(runs, opened.manifest)
+        print_tables(summary_tables(shown), summary_legend(runs))
         say(describe_controllers(opened.manifest))
+        say("\n".join(describe_tuning(opened.manifest)))
         print_faults(opened, runs)
         if out is None:
             point_latest(folder)

@@ -25,6 +25,7 @@ from servobench.harness.analysis.folder import (
     describe_controllers,
     describe_folder,
     describe_settings,
+    describe_tuning,
     titled_runs,
 )
 from servobench.harness.analysis.verdict import judge, leaders
@@ -145,7 +146,8 @@ def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
     shown = _shown(runs)
     numbered = tables.runs_table(shown)
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
-    facts = describe_folder(folder.manifest, runs)
+    manifest = folder.manifest
+    facts = describe_folder(manifest, runs)
     return _template().render(
         folder=folder.path.resolve().name,
         policy=_policy(style, scripts),
@@ -157,7 +159,9 @@ def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
         verdict=judge(runs),
         leaders=leaders(runs),
         scope=_scope(runs, facts),
-        aids=describe_controllers(folder.manifest),
+        aids=describe_controllers(manifest),
+        tuning=describe_tuning(manifest),
+        tuned=manifest.get("tuned", {}),
         band=comparison.settling_band(runs),
         following=comparison.settling_band(runs, FOLLOWING_BANDS),
         published=PUBLISHED,

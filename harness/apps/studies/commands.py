@@ -98,9 +98,11 @@ def suite(
 
     A score is the error or time of a method that knows the true robot over that of the method; a lost run has 0.
     """
+    from servobench.harness.analysis.folder import describe_tuning, mark_tuned
     from servobench.harness.apps.studies.challenge import GRADES, choose_challenges
     from servobench.harness.apps.studies.suite import carry_out_suite, suite_tables
     from servobench.harness.batch.plan import parse_seeds
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.cli.progress import watching
 
     grades = split_words(grade)
@@ -114,7 +116,10 @@ def suite(
     runs = {world.name: world.cells(where, names, robots, reference_seeds) for world in worlds}
     with watching(console, out, running.execution()) as how:
         judged = carry_out_suite(out, worlds, runs, overrides.settings(), how)
-    print_tables(suite_tables(judged), "score: reference over method, at most 1; 0 for a lost run")
+    manifest = ResultsFolder(out / worlds[0].name).manifest
+    shown = mark_tuned(judged, manifest)
+    print_tables(suite_tables(shown), "score: reference over method, at most 1; 0 for a lost run")
+    say("\n".join(describe_tuning(manifest)))
     say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")
 
 
