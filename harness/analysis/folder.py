@@ -83,7 +83,13 @@ def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> lis
     tuned = manifest.get("tuned", {})
     own = manifest.get("own_controllers", {})
     names = manifest.get("controllers", ())
-    lines = [f"{TUNED} {name} was tuned: {facts.get('budget')}" for name, facts in tuned.items()]
+    changed = [key.split(".")[0] for key in manifest.get("changed") or ()]
+    lines = []
+    for name, facts in tuned.items():
+        line = f"{TUNED} {name} was tuned: {facts.get('budget')}"
+        if name in changed:
+            line += ", and then given other settings"
+        lines.append(line)
     known = {name for name in names if name in CONTROLLERS and tuned_settings(name)} | tuned.keys()
     untuned = []
     places = []

@@ -252,6 +252,8 @@ def test_the_untuned_among_tuned_are_named_with_the_command():
     assert describe_tuning(pilot) == []
     tuned = manifest | {"tuned": {"Mine": {"budget": "1 × 2 trials"}}}
     assert describe_tuning(tuned) == ["† Mine was tuned: 1 × 2 trials"]
+    (line,) = describe_tuning(tuned | {"changed": {"run.period": 0.1, "Mine.gain": 2.0}})
+    assert line == "† Mine was tuned: 1 × 2 trials, and then given other settings"
 
 
 def test_values_are_only_those_of_the_folder_of_the_code(tuned, own_folder):
