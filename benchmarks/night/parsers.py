@@ -30,7 +30,7 @@ from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.analysis.folder import describe_folder, describe_settings
-from servobench.harness.analysis.tables import statistics_tables
+from servobench.harness.analysis.tables import judge_places
 from servobench.harness.apps.tuning.objective import Ledger
 from servobench.harness.batch import results, store
 from servobench.harness.batch.integrity import examine
@@ -288,7 +288,7 @@ def _settings(folder: ResultsFolder) -> None:
 def _judged(folder: ResultsFolder) -> None:
     runs = folder.runs()
     describe_folder(folder.manifest, runs)
-    list(statistics_tables(runs))
+    list(judge_places(runs).tables())
 
 
 @cache

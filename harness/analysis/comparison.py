@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import NormalDist
 from typing import Any, Final, Literal
 
@@ -89,8 +90,30 @@ class Difference:
 
     mean: Estimate  # of first − second over the robots on which neither is lost, with Student's interval of 90 %
     probability: Estimate  # P(first < second) + P(equal)/2 on a robot, where a lost run is worse than any other
+    signs: tuple[int, int]  # number of robots on which the first, and the second, has less
     lost: tuple[int, int]  # number of lost runs of the first and of the second
     verdict: Verdict  # on the first
+    told_by_lost: bool  # whether the lost runs decide, not the mean
+
+    @cached_property
+    def p_value(self) -> float:
+        """Of the two-sided exact sign test that neither has less more often; a lost run is worst, ties are left out."""
+        from scipy import stats  # noqa: PLC0415 - as below
+
+        first_less, second_less = self.signs
+        if first_less + second_less == 0:
+            return 1.0
+        with np.errstate(under="ignore"):
+            return float(stats.binomtest(first_less, first_less + second_less).pvalue)
+
+    @property
+    def on_average(self) -> bool:
+        """Whether better or worse is said of the mean alone: the sign test does not show it."""
+        if self.told_by_lost or self.verdict not in ("better", "worse"):
+            return False
+        first_less, second_less = self.signs
+        same_side = (first_less > second_less) == (self.verdict == "better")
+        return self.p_value >= ALPHA or not same_side
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Difference:
@@ -116,10 +139,13 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
     only_second_lost = int(np.count_nonzero(difference == -np.inf))
     lost_alike = abs(only_first_lost - only_second_lost) <= LOST_MARGIN * count
     verdict: Verdict = "undecided"
+    told_by_lost = False
     if is_majority(only_first_lost, only_second_lost):
         verdict = "worse"
+        told_by_lost = True
     elif is_majority(only_second_lost, only_first_lost):
         verdict = "better"
+        told_by_lost = True
     elif mean.count < MIN_PAIRS:
         verdict = "undecided"
     elif mean.low > margin or mean.high < -margin:
@@ -129,8 +155,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
     # P(first < second) + P(equal)/2 = 1/2 − E(sign)/2; a robot that both lose counts as equal.
     sign = np.where(np.isnan(difference), 0.0, np.sign(difference))
     probability = 0.5 - 0.5 * float(sign.sum()) / max(count, 1)
+    signs = int((sign < 0.0).sum()), int((sign > 0.0).sum())
     lost = int(np.isinf(one).sum()), int(np.isinf(other).sum())
-    return Difference(mean, _wilson(probability, count), lost, verdict)
+    return Difference(mean, _wilson(probability, count), signs, lost, verdict, told_by_lost)
 
 
 def is_majority(ones: int, others: int) -> bool:
@@ -283,6 +310,7 @@ HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 # Differences that do not matter, see `margin`
 ERROR_MARGIN: Final = 0.04  # [1] share of the settling band: 0.2 mm in 5 mm
 BOUND_MARGIN: Final = 0.1  # [1] share of the error of a controller that knows the robot
+MEDIAN_MARGIN: Final = 0.1  # [1] share of the best median, of metrics without a natural margin
 SHARE_MARGIN: Final = 0.01  # [1]
 SECOND_LAP: Final = "rms_error_second_lap"
 POINT_TO_POINT: Final = "point_to_point"
@@ -470,13 +498,17 @@ def margin(name: str, runs: pd.DataFrame) -> float:
     """Return the difference in a metric of runs of one place that does not matter, in the unit of its column.
 
     For a time that is one control period; for an error 0.2 mm, as a share of the settling band, or a tenth of the
-    median of the best controller that knows the robot if that is more; for a share or ratio 0.01; else 0.
+    median of the best controller that knows the robot if that is more; for a share or ratio 0.01; else a tenth of the
+    median that is nearest to zero.
     """
     unit = METRICS[name].unit if name in METRICS else "unknown"
     if unit == "s":
         return float(column_of(runs, "period_s").fillna(RunSettings.period).max())
+    if unit == "1":
+        return SHARE_MARGIN
     if unit:
-        return SHARE_MARGIN if unit == "1" else 0.0
+        medians = column_of(runs, name).groupby(runs["controller"]).median().abs()
+        return float(np.nan_to_num(MEDIAN_MARGIN * medians.min()))
     names = [each for each in runs["controller"].unique() if knows_truth(str(each))]
     bounds = runs[runs["controller"].isin(names)]
     best = column_of(bounds, name).groupby(bounds["controller"]).median().min()

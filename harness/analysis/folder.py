@@ -53,20 +53,28 @@ def titled_runs(folder: ResultsFolder) -> pd.DataFrame:
     return runs.assign(mismatch=runs["mismatch"].mask(drawn, FROM_TWIN))
 
 
-def describe_controllers(manifest: Mapping[str, Any]) -> str:
-    """Return one line that says which of several controllers have the aids; empty for a single one."""
-    names = manifest.get("controllers", ())
+def describe_controllers(
+    manifest: Mapping[str, Any], names: Mapping[str, str] | None = None
+) -> str:
+    """Return one line that says which of several controllers have the aids; empty for a single one.
+
+    Args:
+        manifest: of their folder.
+        names: the controllers with the names by which they are shown; None for all of the folder with their own.
+    """
+    if names is None:
+        names = {name: name for name in manifest.get("controllers", ())}
     if len(names) < 2:
         return ""
     configuration = manifest.get("configuration", {})
     own = manifest.get("own_controllers", {})
     found: dict[str, list[str]] = {}
-    for name in names:
+    for name, label in names.items():
         values = configuration.get(name)
         place = own.get(name, {}).get("place", name)
         known = values is not None and not place.startswith(MAPPED)
         words = describe_aids(values) if known else "aids unknown"
-        found.setdefault(words, []).append(name)
+        found.setdefault(words, []).append(label)
     return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
 
 
@@ -108,10 +116,19 @@ def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> lis
     return [*lines, line]
 
 
+def marked(names: Mapping[str, str], manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Return controllers with the names by which tables show them, and a mark where their user tuned them.
+
+    The lines of `describe_tuning` explain it.
+    """
+    marks = {name: f"{names[name]} {TUNED}" for name in manifest.get("tuned", {}) if name in names}
+    return {**names, **marks}
+
+
 def mark_tuned(runs: pd.DataFrame, manifest: Mapping[str, Any]) -> pd.DataFrame:
-    """Return runs for tables, in which controllers that their user tuned have a mark, see `describe_tuning`."""
-    marks = {name: f"{name} {TUNED}" for name in manifest.get("tuned", {})}
-    return runs.replace({"controller": marks})
+    """Return runs for tables, in which controllers that their user tuned are `marked`."""
+    names = {name: name for name in manifest.get("tuned", {})}
+    return runs.replace({"controller": marked(names, manifest)})
 
 
 def describe_settings(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:

@@ -2,8 +2,8 @@
 
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 import pandas as pd
 
@@ -12,7 +12,9 @@ from servobench.harness.analysis.folder import (
     describe_folder,
     describe_tuning,
 )
-from servobench.harness.analysis.tables import PAIR, Tables
+from servobench.harness.analysis.tables import DIFFERENCE, Statistics, as_text
+from servobench.harness.config.installation import short_commit
+from servobench.harness.run.outcome import FOLLOWED, SETTLED
 from servobench.harness.run.variations import varied_columns
 
 SIGNS: Final = str.maketrans(
@@ -27,13 +29,15 @@ SIGNS: Final = str.maketrans(
         "−": "$-$",
         "×": r"$\times$",
         "†": r"$^\dagger$",
+        "<": "$<$",
+        ">": "$>$",
         "µ": r"$\mu$",
         "²": "$^2$",
         "³": "$^3$",
     }
 )
 INTERVAL: Final = re.compile(r" (\[[^\[]*\])$")
-NUMBER: Final = re.compile(r"[-+\d∞–]")
+NUMBER: Final = re.compile(r"[-+<\d∞–]")
 MINUS: Final = re.compile(r"(?<![\w.])-(?=\d)")
 MAX_LETTERS_OF_ONE_COLUMN: Final = 50  # a table with wider rows spans both columns of a paper
 HEADING: Final = 12  # letters on one line of a heading
@@ -47,31 +51,64 @@ BIBTEX: Final = r"""\begin{filecontents*}[overwrite]{servobench.bib}
 \end{filecontents*}"""
 
 
-def latex_tables(tables: Tables) -> Iterator[str]:
-    """Yield tables of statistics in LaTeX; the caption of paired differences names their place, too."""
-    place = ""
-    for title, rows in tables:
-        caption = title
-        if rows.columns[0] == PAIR:
-            caption = f"{place}: {title}"
-        else:
-            place = title
-        yield _table(caption, rows)
+def latex_tables(statistics: Statistics, folder: str) -> Iterator[str]:
+    """Yield the tables of statistics in LaTeX: places whose tables have the same columns share one.
+
+    Args:
+        statistics: of a results folder.
+        folder: its name, for the labels `tab:FOLDER-settled`, `tab:FOLDER-followed` and `tab:FOLDER-pairs`.
+    """
+    name = re.sub(r"[^\w.-]", "-", folder)
+    controllers = [_Part(place.words, as_text(place.controllers)) for place in statistics.places]
+    for kind in (SETTLED, FOLLOWED):
+        parts = [part for part in controllers if f"{kind} [%]" in part.rows]
+        if parts:
+            caption = f"Share of runs that {kind}, medians and failures"
+            yield _table(caption, f"tab:{name}-{kind}", parts)
+    pairs = []
+    for place in statistics.places:
+        if place.pairs:
+            measure = f"{DIFFERENCE} in {place.measure}"
+            rows = as_text(place.pairs).rename(columns={measure: DIFFERENCE})
+            words = f"{place.words}: {place.measure}, margin {place.margin}"
+            pairs.append(_Part(words, rows))
+    if pairs:
+        caption = f"Paired differences, p corrected (Holm) over the {statistics.family}"
+        yield _table(caption, f"tab:{name}-pairs", pairs)
 
 
-def _table(title: str, rows: pd.DataFrame) -> str:
-    """Return a table of text for the package booktabs, over both columns of a paper if it is wide."""
+class _Part(NamedTuple):
+    """The rows of a place in a table."""
+
+    words: str
+    rows: pd.DataFrame
+
+
+def _table(caption: str, label: str, parts: Sequence[_Part]) -> str:
+    """Return a table of text for the package booktabs, over both columns of a paper if it is wide.
+
+    A single place is named in the caption, each of several above its rows.
+    """
+    rows = pd.concat([part.rows for part in parts])
     letters = sum(rows[name].str.len().max() for name in rows)
     kind = "table" if letters <= MAX_LETTERS_OF_ONE_COLUMN else "table*"
     sides = "".join("r" if rows[name].str.match(NUMBER).all() else "l" for name in rows)
     headings = " & ".join(map(_heading, rows.columns, sides))
-    body = [rf"{' & '.join(row)} \\" for row in rows.map(_cell).itertuples(index=False)]
+    body = []
+    for part in parts:
+        if len(parts) == 1:
+            caption += f": {part.words}"
+        else:
+            place = part.words.translate(SIGNS)
+            body.append(rf"\multicolumn{{{len(sides)}}}{{@{{}}l}}{{\itshape {place}}} \\")
+        body += [rf"{' & '.join(row)} \\" for row in part.rows.map(_cell).itertuples(index=False)]
+        body.append(r"\midrule")
     lines = [
         rf"\begin{{{kind}}}\centering\footnotesize\setlength{{\tabcolsep}}{{4pt}}",
-        rf"\caption{{{title.translate(SIGNS)}}}",
+        rf"\caption{{{caption.translate(SIGNS)}}}\label{{{label}}}",
         rf"\begin{{tabular}}{{@{{}}{sides}@{{}}}}\toprule",
         rf"{headings} \\\midrule",
-        *body,
+        *body[:-1],
         rf"\bottomrule\end{{tabular}}\end{{{kind}}}",
     ]
     return "\n".join(lines)
@@ -93,25 +130,44 @@ def _heading(name: str, side: str) -> str:
     return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}"
 
 
-def methods_paragraph(manifest: Mapping[str, Any], runs: pd.DataFrame) -> str:
-    """Return a paragraph that says how the runs of a folder were made, from its manifest, and its BibTeX entry."""
-    facts = describe_folder(manifest, runs)
+def methods_paragraph(
+    manifest: Mapping[str, Any],
+    runs: pd.DataFrame,
+    statistics: Statistics,
+    names: Mapping[str, str],
+) -> str:
+    """Return a paragraph that says how the runs of a folder were made and judged, and its BibTeX entry.
+
+    Args:
+        manifest: of the folder.
+        runs: all of its runs.
+        statistics: those that are shown.
+        names: the controllers that are shown, with their names in tables.
+    """
+    shown = runs[runs["controller"].isin(list(names))]
+    titles = [
+        f"{label} ({name})".replace(f"{name} ({name})", name) for name, label in names.items()
+    ]
+    facts = describe_folder(manifest, shown) | {"controller": ", ".join(titles)}
     packages = manifest.get("packages") or {}
     version = str(packages.get("servobench") or "unknown").translate(SIGNS)
-    commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
+    commit = short_commit(manifest.get("git_commit") or "unknown").translate(SIGNS)
     python = manifest.get("python", "unknown")
     tools = ", ".join([f"Python {python}", *_used_libraries(manifest)]).translate(SIGNS)
     # The first sentence is LaTeX already, with a citation; the others are plain text.
     first = f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, {tools})"
     sentences = [
         _combinations(manifest, facts),
-        *_aids(manifest),
+        *_aids(manifest, names),
         *describe_tuning(manifest, command=False),
-        *_varied(facts, runs),
-        _robots(facts, runs),
+        *_varied(facts, shown),
+        _robots(facts, shown),
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
         "Differences are paired by robot, with Student's intervals (90 %) of their means; verdicts are those of a sign "
         "test on lost runs, which ended early or have no value, and of two one-sided t-tests (5 %) against the margin",
+        "p-values are those of two-sided exact sign tests over robots, where a lost run is worse than any other; in "
+        f"brackets after Holm's correction ({statistics.family}); on average: the sign test does not show the verdict "
+        "of the means (5 %)",
         _settings(manifest.get("changed")),
     ]
     text = ". ".join([first, *(each.translate(SIGNS) for each in sentences)])
@@ -138,9 +194,9 @@ def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
     )
 
 
-def _aids(manifest: Mapping[str, Any]) -> list[str]:
-    """Return a sentence on the aids of several controllers; none for a single one."""
-    aids = describe_controllers(manifest)
+def _aids(manifest: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
+    """Return a sentence on the aids of several controllers, by their names in tables; none for a single one."""
+    aids = describe_controllers(manifest, names)
     if not aids:
         return []
     return [f"Aids (stages around the law, which any controller can have): {aids}"]

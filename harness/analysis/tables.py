@@ -8,10 +8,10 @@ the group without a name. Numbers are in handy units.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 import pandas as pd
 
@@ -28,6 +28,7 @@ from servobench.harness.analysis.comparison import (
     column_of,
     compare_pairs,
     grouped,
+    holm,
     in_handy_units,
     is_superfluous,
     margin,
@@ -84,7 +85,10 @@ SWEEP_COLUMNS: Final = (
     "rms_error_evaluated",
     *BAND,
 )
-PAIR: Final = "A − B"  # heading of the first column of paired differences
+# Headings of columns of paired differences
+PAIR: Final = "A − B"
+DIFFERENCE: Final = "mean difference"
+P_VALUE: Final = "p (Holm)"
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 
@@ -93,7 +97,7 @@ LATE: Final = "*"  # mark of a controller of which a step took longer than the p
 class Cell:
     """A value and how it is written."""
 
-    value: str | float | Estimate
+    value: str | float | Estimate | PValue
     spec: str = ""  # of `format`
 
     def __str__(self) -> str:
@@ -105,7 +109,7 @@ class Cell:
 
     def plain(self) -> object:
         """Return it as JSON can have it: an estimate with its ends, None for no number, "inf" for infinity."""
-        if isinstance(self.value, Estimate):
+        if isinstance(self.value, Estimate | PValue):
             return {name: _plain(number) for name, number in asdict(self.value).items()}
         if isinstance(self.value, str):
             return self.value
@@ -131,24 +135,94 @@ def as_plain(rows: list[Row]) -> list[dict[str, object]]:
     return [{name: cell.plain() for name, cell in row.items()} for row in rows]
 
 
-def statistics_tables(runs: pd.DataFrame, metric: str | None = None) -> Tables:
-    """Yield for each plant, task and condition how each controller does, and how each pair of them differs."""
-    for words, controllers, pairs in statistics_rows(runs, metric):
-        yield words, as_text(controllers)
-        if pairs:
-            table = as_text(pairs)
-            yield f"paired differences, verdicts with a margin of {table.pop('margin')[0]}", table
+class Selection(NamedTuple):
+    """What statistics show of the controllers of a folder."""
+
+    names: Mapping[str, str]  # those that are shown, in this order, with their names in tables
+    metric: str | None = None  # column by which pairs are compared; None for the usual one
+    against: str | None = None  # which is A in all pairs that are shown; None for all pairs
 
 
-def statistics_rows(
-    runs: pd.DataFrame, metric: str | None = None
-) -> Iterator[tuple[str, list[Row], list[Row]]]:
-    """Yield for each plant, task and condition its words, a row for each controller and one for each pair of them."""
+class JudgedPlace(NamedTuple):
+    """The statistics of a plant, task and condition."""
+
+    words: str  # which one it is
+    controllers: list[Row]
+    pairs: list[Row]
+    measure: str  # metric by which pairs are compared, with its unit; empty without pairs
+    margin: str  # difference that does not matter, with its unit; likewise
+
+
+class Statistics(NamedTuple):
+    """How each controller does in each place, and how each pair of them differs."""
+
+    places: list[JudgedPlace]
+    verdicts: int  # pairs of all controllers of the folder, in all places
+
+    @property
+    def family(self) -> str:
+        """The number of verdicts shown, over which p-values are corrected, and that of the folder."""
+        shown = sum(len(place.pairs) for place in self.places)
+        verdicts = "verdict" if shown == 1 else "verdicts"
+        return f"{shown} {verdicts} shown, {self.verdicts} in this folder"
+
+    @property
+    def legend(self) -> str:
+        """The levels of intervals, and the test behind p-values with its family."""
+        if not any(place.pairs for place in self.places):
+            return "brackets: 95 %"
+        return (
+            "brackets: 95 %, of mean differences 90 %\n"
+            f"p: two-sided sign test; after Holm's correction over the {self.family}"
+        )
+
+    def tables(self) -> Tables:
+        """Yield a table of the controllers of each place, and one of their pairs if it has any."""
+        for place in self.places:
+            yield place.words, as_text(place.controllers)
+            if place.pairs:
+                title = f"paired differences, verdicts with a margin of {place.margin}"
+                yield title, as_text(place.pairs)
+
+
+@dataclass(frozen=True)
+class PValue:
+    """A p-value; `f"{p:.3f}"` is `0.004 (0.021)`, the second one after Holm's correction."""
+
+    p: float
+    holm: float
+
+    def __format__(self, spec: str) -> str:
+        """Return both, each formatted with `spec`; below a thousandth only that."""
+        both = [format(p, spec) if p >= 0.001 else "<0.001" for p in (self.p, self.holm)]
+        return "{} ({})".format(*both)
+
+
+def judge_places(runs: pd.DataFrame, selection: Selection | None = None) -> Statistics:
+    """Return how controllers of a folder do, and how pairs of them differ, for each plant, task and condition.
+
+    Args:
+        runs: all runs of the folder, as margins do not depend on those that are shown.
+        selection: of those that are shown; None for all.
+
+    Raises:
+        ConfigurationError: a metric that is no column of numbers, or without a pair to compare.
+    """
+    known = list(runs["controller"].unique())
+    shown = selection or Selection({name: name for name in known})
+    places = []
+    verdicts = 0
     for words, place in split_conditions(runs):
-        yield words, _controller_rows(place), _pair_rows(place, metric)
+        verdicts += len(_pairs(place, known))
+        places.append(JudgedPlace(words, _controller_rows(place, shown), *_pair_rows(place, shown)))
+    pairs = [row for place in places for row in place.pairs]
+    p_values = [cast("float", row[P_VALUE].value) for row in pairs]
+    for row, p_value, corrected in zip(pairs, p_values, holm(p_values), strict=True):
+        row[P_VALUE] = Cell(PValue(p_value, corrected), ".3f")
+    return Statistics(places, verdicts)
 
 
-def _controller_rows(runs: pd.DataFrame) -> list[Row]:
+def _controller_rows(runs: pd.DataFrame, selection: Selection) -> list[Row]:
     """Return how each controller of a place does: good runs, medians, the worst runs and the failures."""
     heading = {name: metric_heading(name, runs) for name in METRICS}
     is_curve = achievement(runs) == FOLLOWED
@@ -156,12 +230,14 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
     unit_of_error = heading[judged].rpartition(" ")[2]
     _, factor = shown_unit(judged, runs)
     rows = []
-    for name, own in runs.groupby("controller", sort=False):
+    by_controller = dict(list(runs.groupby("controller")))
+    for name in [name for name in selection.names if name in by_controller]:
+        own = by_controller[name]
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
         failures = ", ".join(f"{count} {kind}" for kind, count in failed.items())
         error = factor * column_of(own, judged).where(own["status"] == COMPLETED)
-        row = {"controller": Cell(str(name)), "runs": Cell(len(own))}
+        row = {"controller": Cell(selection.names[name]), "runs": Cell(len(own))}
         row[f"{achievement(runs)} [%]"] = Cell(achieved_share(own), ".1f")
         if not is_curve:
             overshoot = 100.0 * column_of(own, "overshoot")
@@ -174,21 +250,28 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
     return rows
 
 
-def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
-    seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller", sort=False)}
-    # A batch may be unfinished
-    pairs = [pair for pair in combinations(seeds, 2) if seeds[pair[0]] & seeds[pair[1]]]
-    if not pairs and metric is None:
-        return []
+def _pairs(
+    runs: pd.DataFrame, names: Iterable[str], against: str | None = None
+) -> list[tuple[str, str]]:
+    """Return pairs of some controllers of a place, those that share a seed: a batch may be unfinished."""
+    seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller")}
+    pairs = combinations([name for name in names if name in seeds], 2)
+    found = [pair for pair in pairs if against in (None, *pair) and seeds[pair[0]] & seeds[pair[1]]]
+    return [pair if pair[1] != against else pair[::-1] for pair in found]
+
+
+def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str, str]:
+    """Return a row for each pair of a place that is shown, with their metric and its margin as they are shown."""
+    pairs = _pairs(runs, selection.names, selection.against)
+    metric = selection.metric or judged_metric(runs)
+    if not pairs and selection.metric is None:
+        return [], "", ""
     if not pairs:
         raise ConfigurationError(
             f"no two controllers have runs of one seed to compare; leave --metric {metric} out"
         )
-    judged = judged_metric(runs)
-    if metric is None:
-        metric = judged
     filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
-    numbers = {judged, *map(str, filled)} & set(runs) - {"seed"}
+    numbers = {judged_metric(runs), *map(str, filled)} & set(runs) - {"seed"}
     if metric not in numbers:
         raise ConfigurationError(
             f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}"
@@ -203,20 +286,22 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
         if METRICS[metric].better:
             words = {}
     better = words.get("better", "better")
-    small = f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")
     rows = []
     for (first, second), each in zip(pairs, compared, strict=True):
         lost_first, lost_second = each.lost
+        verdict = words.get(each.verdict, each.verdict)
+        if each.on_average:
+            verdict += " on average"
         row = {
-            PAIR: Cell(f"{first} − {second}"),
+            PAIR: Cell(f"{selection.names[first]} − {selection.names[second]}"),
             "runs lost": Cell(f"{lost_first} : {lost_second}"),
-            f"mean difference in {heading}": Cell(each.mean.scaled(factor), ".2f"),
-            "verdict": Cell(words.get(each.verdict, each.verdict)),
+            f"{DIFFERENCE} in {heading}": Cell(each.mean.scaled(factor), ".2f"),
+            "verdict": Cell(verdict),
             f"P(A {better})": Cell(each.probability, ".2f"),
-            "margin": Cell(small),
+            P_VALUE: Cell(each.p_value),
         }
         rows.append(row)
-    return rows
+    return rows, heading, f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")
 
 
 def _median(values: pd.Series[float]) -> Estimate:

@@ -194,6 +194,22 @@ RunIdOption = Annotated[
     str | None,
     named_option("--run", "RUN_ID", "The run_id, where the folder has more than one run."),
 ]
+ShownOption = Annotated[
+    str,
+    named_option(
+        "--controllers",
+        "NAMES",
+        "Comma-separated names, in this order; default: all of the folder.",
+    ),
+]
+NamesOption = Annotated[
+    str,
+    named_option(
+        "--names",
+        "NAMES",
+        "Their names here: CONTROLLER=NAME,..., or all in the order of --controllers.",
+    ),
+]
 JsonOption = Annotated[bool, switch("--json", "Print JSON, for other programs.")]
 DebugOption = Annotated[
     bool,

@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from servobench.harness.cli.options import JsonOption, named_option, option, switch
-from servobench.harness.cli.selection import split_names
+from servobench.harness.cli import selection
+from servobench.harness.cli.options import (
+    JsonOption,
+    NamesOption,
+    ShownOption,
+    named_option,
+    option,
+    switch,
+)
 from servobench.harness.cli.terminal import (
     FAILED,
     print_json,
@@ -37,6 +44,11 @@ def statistics(
             "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
         ),
     ] = None,
+    controllers: ShownOption = "all",
+    names: NamesOption = "",
+    against: Annotated[
+        str | None, option("NAME", "Only pairs with this controller, which is A in them.")
+    ] = None,
     markdown: Annotated[bool, switch("--markdown", "Print the tables as Markdown.")] = False,
     latex: Annotated[
         bool,
@@ -46,19 +58,20 @@ def statistics(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Judge the controllers of a folder, with intervals.
+    """Judge the controllers of a folder, with intervals and p-values.
 
     Rates, medians, tails, failures and paired differences.
     """
     from servobench.harness.analysis.folder import (
         describe_controllers,
         describe_tuning,
-        mark_tuned,
+        marked,
         titled_runs,
     )
     from servobench.harness.analysis.latex import latex_tables, methods_paragraph
-    from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
+    from servobench.harness.analysis.tables import Selection, as_plain, judge_places
     from servobench.harness.batch.results import ResultsFolder
+    from servobench.plant.contract.settings import suggest
 
     if markdown + latex + as_json > 1:
         raise ConfigurationError(
@@ -66,26 +79,40 @@ def statistics(
         )
     opened = ResultsFolder(folder)
     runs = titled_runs(opened)
+    opened.check_runs(runs)
+    shown = selection.split_names("controllers", controllers, list(runs["controller"].unique()))
+    if against is not None and against not in shown:
+        raise ConfigurationError(f"--against: unknown {against!r}: {suggest(against, shown)}")
+    labels = selection.split_labels(names, shown)
+    wanted = Selection(labels, metric, against)
+    if not as_json:
+        wanted = wanted._replace(names=marked(labels, opened.manifest))
     missing = opened.describe_missing()
+    found = judge_places(runs, wanted)
     if as_json:
         if missing:
             sys.stderr.write(f"{missing}\n")
-        found = [
-            {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
-            for place, controllers, pairs in statistics_rows(runs, metric)
+        places = [
+            {
+                "place": place.words,
+                "controllers": as_plain(place.controllers),
+                "pairs": [{**row, "margin": place.margin} for row in as_plain(place.pairs)],
+            }
+            for place in found.places
         ]
-        print_json(found)
+        print_json(places)
         return
     say(f"% {missing}" if latex and missing else missing)
-    tables = statistics_tables(mark_tuned(runs, opened.manifest), metric)
     if latex:
-        say("\n\n".join([*latex_tables(tables), methods_paragraph(opened.manifest, runs)]))
+        tables = latex_tables(found, folder.resolve().name)
+        say("\n\n".join([*tables, methods_paragraph(opened.manifest, runs, found, labels)]))
         return
     if markdown:
-        print_markdown(tables)
+        print_markdown(found.tables())
     else:
-        print_tables(tables)
-    say(describe_controllers(opened.manifest))
+        print_tables(found.tables())
+    say(found.legend)
+    say(describe_controllers(opened.manifest, labels))
     say("\n".join(describe_tuning(opened.manifest)))
 
 
@@ -140,9 +167,7 @@ def export(
     run: Annotated[
         str | None, named_option("--run", "RUN_ID", "One run alone; default: all.")
     ] = None,
-    controllers: Annotated[
-        str, option("NAMES", "Comma-separated names; default: all of the folder.")
-    ] = "all",
+    controllers: ShownOption = "all",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
     from servobench.harness.analysis.exports import export_folder
@@ -155,7 +180,7 @@ def export(
         chosen = find_run(opened, run)["run_id"]
         runs = runs[runs["run_id"] == chosen]
     known = list(dict.fromkeys(runs["controller"]))
-    runs = runs[runs["controller"].isin(split_names("controllers", controllers, known))]
+    runs = runs[runs["controller"].isin(selection.split_names("controllers", controllers, known))]
     say(opened.describe_missing())
     files = export_folder(opened, out, format_, runs)
     say(f"{len(files)} files in {out}")

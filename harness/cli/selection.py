@@ -228,3 +228,38 @@ def split_names(
         if names.count(name) > 1:
             raise ConfigurationError(f"--{option} names {name} twice")
     return tuple(names)
+
+
+def split_labels(text: str, shown: Sequence[str]) -> dict[str, str]:
+    """Return the name in figures and tables of each controller that is shown.
+
+    Args:
+        text: of the option --names: a name for each controller in their order, or `CONTROLLER=NAME` for some of them;
+            if empty, they keep their names.
+        shown: the controllers.
+
+    Raises:
+        ConfigurationError: a name for an unknown controller, too few or too many, or one for several controllers.
+    """
+    from servobench.plant.contract.settings import suggest
+
+    labels = {name: name for name in shown}
+    words = [word.strip() for word in text.split(",") if text]
+    if all("=" in word for word in words):
+        for word in words:
+            named = [name for name in shown if word.startswith(f"{name}=")]
+            if not named:
+                unknown = word.partition("=")[0]
+                raise ConfigurationError(f"--names: unknown {unknown!r}: {suggest(unknown, shown)}")
+            labels[named[0]] = word.removeprefix(f"{named[0]}=")
+    elif len(words) == len(shown):
+        labels = dict(zip(shown, words, strict=True))
+    else:
+        raise ConfigurationError(
+            f"--names has {len(words)} names for {len(shown)} controllers: {', '.join(shown)}"
+        )
+    if len(set(labels.values())) < len(labels):
+        raise ConfigurationError(
+            f"--names has one name for several controllers: {', '.join(labels.values())}"
+        )
+    return labels

@@ -70,6 +70,9 @@ def _line(module: str, user: str) -> str:
 
 CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
 COMMIT_DIGITS = 12  # that a reader is shown
+DIRTY: Final = "-dirty"  # mark of a commit where code differs from it
+# File beside the code of a built distribution that holds the commit; .ci/commit_hook.py writes it
+COMMIT_FILE: Final = "commit.txt"
 # Folder of the checkout, if this code lies in one
 CHECKOUT: Final = Path(__file__).resolve().parents[2]
 GIT_TIME: Final = 10.0  # [s] for an answer of git
@@ -108,7 +111,7 @@ def read_checkout() -> tuple[str | None, str | None]:
     The commit is marked where code differs from it.
     """
     try:
-        return _read_commit(CHECKOUT), None
+        return read_commit(CHECKOUT), None
     except CommitUnknown as error:
         return None, str(error)
 
@@ -118,11 +121,19 @@ def version_line() -> str:
     line = f"servobench {installed_version() or 'not installed'}"
     commit, reason = read_checkout()
     if commit is not None:
-        hash_, dirty, _ = commit.partition("-dirty")
-        return f"{line} (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})"
+        return f"{line} (commit {short_commit(commit)})"
     if reason is None:
         return line
     return f"{line} (commit unknown: {reason})"
+
+
+def short_commit(commit: str) -> str:
+    """Return a commit as a reader is shown it."""
+    hash_, dirty, _ = commit.partition(DIRTY)
+    short = hash_[:COMMIT_DIGITS]
+    if dirty:
+        return f"{short}, with changes"
+    return short
 
 
 def blas_libraries() -> list[dict[str, Any]]:
@@ -156,17 +167,20 @@ def blas_libraries() -> list[dict[str, Any]]:
     return found
 
 
-def _read_commit(root: Path) -> str | None:
-    """Return the commit of a checkout, marked where code differs from it; None for a folder that is no checkout.
+def read_commit(root: Path) -> str | None:
+    """Return the commit of a checkout, marked where code differs from it, or of an installed distribution.
+
+    None where a folder is neither.
 
     Raises:
         CommitUnknown: git is not there, or refuses to answer.
     """
     if not (root / ".git").exists():
-        return None
+        built = root / COMMIT_FILE
+        return built.read_text(encoding="ascii").strip() if built.is_file() else None
     commit = _git(root, "rev-parse", "HEAD")
     changed = _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
-    return f"{commit}-dirty" if changed else commit
+    return f"{commit}{DIRTY}" if changed else commit
 
 
 def _git(root: Path, *words: str) -> str:

@@ -1,6 +1,7 @@
 """What is installed: one package, with everything in it that is read at run time."""
 
 import json
+import os
 import subprocess
 import sys
 import tarfile
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from kit.command import carried_out
+from servobench.harness.config.installation import read_checkout, short_commit, version_line
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / ".ci"))
@@ -64,6 +66,18 @@ def test_the_source_distribution_makes_the_same_wheel(files, wheel_names, tmp_pa
     subprocess.run(command, cwd=source, check=True, capture_output=True)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         assert set(wheel.namelist()) == wheel_names
+
+
+def test_a_wheel_of_a_clone_knows_its_commit_when_it_is_installed(files, tmp_path):
+    commit, _ = read_checkout()
+    with zipfile.ZipFile(files[0]) as wheel:
+        wheel.extractall(tmp_path)
+    command = [sys.executable, "-P", "-m", "servobench", "--version"]
+    installed = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    made = carried_out(*command, cwd=tmp_path, env=installed)
+    assert (tmp_path / "servobench" / "commit.txt").read_text() == commit
+    assert made.stdout.strip() == version_line()
+    assert short_commit(commit) in made.stdout
 
 
 def test_the_files_of_a_release_have_no_faults(files):

@@ -35,12 +35,12 @@ def test_the_commit_is_that_of_the_own_checkout_even_below_a_hook_of_another(che
     monkeypatch.setenv("GIT_DIR", str(other / ".git"))
     monkeypatch.setenv("GIT_WORK_TREE", str(other))
     monkeypatch.setenv("GIT_INDEX_FILE", str(other / ".git" / "index"))
-    commit = installation._read_commit(own)
+    commit = installation.read_commit(own)
     monkeypatch.undo()
     assert commit == git(own, "rev-parse", "HEAD")
     (own / "plant" / "code.py").write_text("changed")
-    assert installation._read_commit(own) == f"{commit}-dirty"
-    assert installation._read_commit(own.parent) is None
+    assert installation.read_commit(own) == f"{commit}-dirty"
+    assert installation.read_commit(own.parent) is None
 
 
 def belongs_to_another(folder, monkeypatch):
@@ -76,7 +76,7 @@ def test_an_unknown_commit_has_its_reason(spoil, reason, checkout, monkeypatch):
     folder = checkout("own")
     spoil(folder, monkeypatch)
     with pytest.raises(CommitUnknown, match=reason):
-        installation._read_commit(folder)
+        installation.read_commit(folder)
 
 
 def test_the_version_says_why_the_commit_is_unknown(checkout, monkeypatch):

@@ -15,14 +15,15 @@ from kit.folders import comparison, made_up_row, made_up_steps, sweep, write_fol
 from kit.nightly import NIGHTLY
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import (
+    Selection,
     cost_table,
     curve_tables,
     failure_table,
+    judge_places,
     move_tables,
     outcome_table,
     overview,
     runs_table,
-    statistics_rows,
     summary_legend,
     summary_tables,
 )
@@ -66,9 +67,10 @@ def test_a_metric_of_pairs_is_refused_where_there_is_one_controller():
         ConfigurationError,
         match="no two controllers have runs of one seed to compare; leave --metric",
     ):
-        list(statistics_rows(alone, "settling_time_s"))
-    ((_, controllers, pairs),) = statistics_rows(alone)
-    assert (len(controllers), pairs) == (1, [])
+        judge_places(alone, Selection({"ukf_mfac": "ukf_mfac"}, "settling_time_s"))
+    found = judge_places(alone)
+    assert [(len(place.controllers), place.pairs) for place in found.places] == [(1, [])]
+    assert found.legend == "brackets: 95 %"
 
 
 def test_parts_are_readable_before_and_after_they_are_put_together(folder):
@@ -398,7 +400,7 @@ def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, mon
 def read_runs(folder):
     """Make of a table of runs what `statistics`, `compare`, `report` and the notebook make of it."""
     runs = results.load_runs(folder)
-    list(statistics_rows(runs))
+    judge_places(runs)
     list(summary_tables(runs))
     summary_legend(runs)
     makers = (

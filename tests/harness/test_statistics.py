@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, stats
+from statsmodels.stats.descriptivestats import sign_test
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 from statsmodels.stats.weightstats import ttost_paired
@@ -241,6 +242,35 @@ def test_the_probability_to_be_better_is_counted_with_ties_as_halves():
     assert found.lost == (5, 6)
 
 
+@settings(max_examples=40, deadline=None)
+@given(values=st.lists(st.tuples(*[st.sampled_from([0.0, 1.0, 2.0, np.inf])] * 2), min_size=1))
+def test_the_p_value_is_that_of_a_sign_test_in_which_lost_runs_are_worst(values):
+    first, second = np.array(values).T
+    found = paired_difference(first, second, 0.1)
+    ranks = np.nan_to_num(first, posinf=9.0) - np.nan_to_num(second, posinf=9.0)
+    assert found.signs == ((ranks < 0.0).sum(), (ranks > 0.0).sum())
+    if ranks.any():
+        _, p_value = sign_test(ranks)
+        assert found.p_value == pytest.approx(p_value)
+    else:
+        assert found.p_value == 1.0
+
+
+def test_a_mean_that_a_few_robots_lead_tells_the_two_apart_on_average_only():
+    second = np.full(20, 2.0)
+    alike = paired_difference(second - np.linspace(0.5, 0.6, 20), second, 0.1)
+    assert (alike.verdict, alike.on_average, alike.p_value) == ("better", False, 2.0**-19)
+    few = np.where(np.arange(20) < 12, second - 1.0, second + 0.01)
+    found = paired_difference(few, second, 0.1)
+    assert (found.verdict, found.on_average) == ("better", True)
+    assert found.p_value == pytest.approx(0.5034, abs=1e-4)  # 12 of 20
+    against = paired_difference(np.where(np.arange(20) < 4, -9.0, 2.01), second, 0.1)
+    assert (against.verdict, against.on_average, against.p_value < 0.05) == ("better", True, True)
+    lost = np.where(np.arange(20) < 6, np.inf, second - 0.01)
+    assert paired_difference(lost, second, 0.1).verdict == "worse"
+    assert not paired_difference(lost, second, 0.1).on_average
+
+
 @pytest.mark.parametrize(
     ("lost", "shift", "verdict"),
     [
@@ -279,7 +309,10 @@ def test_margins_are_a_period_a_share_of_the_band_or_of_the_bound_and_a_hundredt
     assert margin(
         "rms_error_evaluated", errors.assign(rms_error_evaluated=[0.1, 0.01, 0.02, 0.02])
     ) == pytest.approx(2e-3)
-    assert margin("control_effort_rad", runs) == margin("mass", runs) == 0.0
+    efforts = runs.assign(control_effort_rad=[4.0, 2.0, 3.0, NEVER], mass=[-2.0, 3.0, 5.0, 9.0])
+    assert margin("control_effort_rad", efforts) == pytest.approx(0.25)  # a tenth of 2.5
+    assert margin("mass", efforts) == pytest.approx(0.2)
+    assert margin("control_effort_rad", runs) == 0.0
 
 
 def test_six_robots_and_a_difference_of_the_margin_are_equivalent():

@@ -6,6 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from kit import folders
 from kit.command import python, servobench
@@ -13,10 +15,11 @@ from kit.folders import comparison, failed_only, made_up_row, sweep, write_folde
 from servobench.harness.analysis.comparison import Estimate, split_conditions, split_tasks
 from servobench.harness.analysis.tables import (
     Cell,
+    Selection,
     curve_tables,
+    judge_places,
     outcome_legend,
     overview,
-    statistics_tables,
     summary_legend,
     summary_tables,
     sweep_tables,
@@ -42,14 +45,19 @@ def runs() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def choosing(runs, **further):
+    """Select all controllers of some runs."""
+    return Selection({name: name for name in runs["controller"].unique()}, **further)
+
+
 def judge_controllers(runs):
     """Return the first table of statistics."""
-    return next(statistics_tables(runs))[1]
+    return next(judge_places(runs).tables())[1]
 
 
 def compare_controllers(runs, metric=None):
     """Return the table of pairs of one place."""
-    _, (title, pairs) = statistics_tables(runs, metric)
+    _, (title, pairs) = judge_places(runs, choosing(runs, metric=metric)).tables()
     margin = "0.2 mm" if (runs["task_kind"] == "curve").all() else "0.05 s"
     assert title == f"paired differences, verdicts with a margin of {margin}"
     return pairs
@@ -75,7 +83,7 @@ def test_pairs_are_compared_on_common_seeds(runs):
     assert row["mean difference in settling time [s]"].startswith("-1.1")
     assert row["verdict"] == "better"
     assert row["P(A better)"] == "1.00 [0.84, 1.00]"
-    assert len(list(statistics_tables(runs[runs["controller"] == "quick"]))) == 1
+    assert len(list(judge_places(runs[runs["controller"] == "quick"]).tables())) == 1
 
 
 def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
@@ -108,7 +116,9 @@ def test_of_a_measure_without_a_good_direction_the_verdict_is_less_or_more(runs)
     runs["max_joint_position_rad"] = (
         np.where(runs["controller"] == "quick", 1.0, 2.0) + 0.001 * runs["seed"]
     )
-    (_, _), (_, pairs) = statistics_tables(runs, "max_joint_position_rad")
+    (_, _), (_, pairs) = judge_places(
+        runs, choosing(runs, metric="max_joint_position_rad")
+    ).tables()
     assert pairs["verdict"].tolist() == ["less"]
     assert "P(A less)" in pairs
 
@@ -129,11 +139,77 @@ def test_a_median_over_many_conditions_is_one_over_runs_and_has_no_interval(runs
     }
 
 
+@pytest.fixture
+def three(runs):
+    """Runs of three controllers on two tasks: `odd` is a little faster than `quick` on 14 of 20 robots."""
+    quick = runs[runs["controller"] == "quick"]
+    gain = np.where(quick["seed"] % 10 < 7, 0.02, -0.02)
+    odd = quick.assign(controller="odd", settling_time_s=quick["settling_time_s"] - gain)
+    one = pd.concat([runs, odd])
+    return pd.concat([one, one.assign(task="exp2")])
+
+
+def test_p_values_are_corrected_over_the_pairs_that_are_shown(three):
+    for selection, names in (
+        (None, ["quick − slow", "quick − odd", "slow − odd"]),
+        (choosing(three, against="odd"), ["odd − quick", "odd − slow"]),
+        (Selection({"odd": "Mine", "slow": "slow"}), ["Mine − slow"]),
+    ):
+        found = judge_places(three, selection)
+        rows = [row for place in found.places for row in place.pairs]
+        assert [str(row["A − B"]) for row in rows] == 2 * names
+        p_values = [row["p (Holm)"].value for row in rows]
+        corrected = multipletests([each.p for each in p_values], method="holm")[1]
+        assert [each.holm for each in p_values] == corrected.tolist()
+        assert f"over the {2 * len(names)} verdicts shown, 6 in this folder" in found.legend
+    (row, _) = (row for row in rows if str(row["A − B"]) == "Mine − slow")
+    assert row["p (Holm)"].plain() == {"p": 2.0**-19, "holm": 2.0**-18}
+    assert str(row["p (Holm)"]) == "<0.001 (<0.001)"
+    (place, _) = judge_places(three, choosing(three, against="odd")).places
+    p_value = place.pairs[0]["p (Holm)"].value.p
+    assert p_value == stats.binomtest(14, 20).pvalue
+    assert str(place.pairs[0]["p (Holm)"]) == f"{p_value:.3f} ({2 * p_value:.3f})"
+
+
+def test_controllers_are_shown_in_the_order_and_by_the_names_that_are_given(three):
+    shown = judge_places(three, Selection({"slow": "Old", "quick": "New"}))
+    for place in shown.places:
+        assert [str(row["controller"]) for row in place.controllers] == ["Old", "New"]
+
+
+def test_a_margin_and_a_verdict_do_not_depend_on_what_is_shown(three):
+    known = three.assign(
+        controller=three["controller"].replace("slow", "calibrated"), task_kind="curve",
+        rms_error_evaluated=three["settling_time_s"].fillna(5.0), status="completed",
+    )  # fmt: skip
+    some = Selection({"quick": "quick", "odd": "odd"})
+    (margin, _), (other, _) = (
+        [place.margin for place in judge_places(known, selection).places]
+        for selection in (None, some)
+    )
+    assert margin == other
+    assert margin != "0.2 mm"
+
+
+def test_a_verdict_that_the_signs_do_not_show_is_one_on_average(three):
+    gain = np.where(three["seed"] < 12, 2.0, -0.04)
+    three["settling_time_s"] -= gain * (three["controller"] == "odd")
+    (place, _) = judge_places(
+        three, choosing(three, metric="settling_time_s", against="odd")
+    ).places
+    assert str(place.pairs[0]["verdict"]) == "better on average"
+    three["max_joint_position_rad"] = three["settling_time_s"]
+    (place, _) = judge_places(
+        three, choosing(three, metric="max_joint_position_rad", against="odd")
+    ).places
+    assert str(place.pairs[0]["verdict"]) == "less on average"
+
+
 def test_a_period_that_is_set_is_the_margin_of_times(tmp_path, monkeypatch):
     monkeypatch.setitem(folders.MANIFEST, "changed", {"run.period": 0.2})
     loaded = results.load_runs(sweep(tmp_path / "sweep"))
     assert loaded["period_s"].unique().tolist() == [0.2]
-    assert "margin of 0.2 s" in [title for title, _ in statistics_tables(loaded)][1]
+    assert "margin of 0.2 s" in [title for title, _ in judge_places(loaded).tables()][1]
 
 
 def test_conditions_are_told_apart_in_words(runs):

@@ -212,6 +212,11 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*SWEEP, "--latency", "0.9", "--set", "random.duration=0.5"), "latency must be shorter than the run of 0.5 s"),
     # results and pictures
     (("statistics", "no.fmu"), "no.fmu is not a results folder"),
+    (("statistics", "results", "--against", "ukf_mfc"), "--against: unknown 'ukf_mfc': did you mean 'ukf_mfac'?"),
+    (("statistics", "results", "--against", "A,B"), "--against: unknown 'A,B'"),
+    (("statistics", "results", "--controllers", "ukf_mfac", "--against", "B"), "--against: unknown 'B'"),
+    (("statistics", "results", "--names", "A"), "--names has 1 names for"),
+    (("statistics", "results", "--names", "Q=quick"), "--names: unknown 'Q'"),
     (("statistics", "results", "--metric", "setling_time_s"), "did you mean 'settling_time_s'?"),
     (("collect", "none"), "none is not a results folder"),
     (("record", "results", "--kinds", "mp5"), "did you mean 'mp4'?"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import named_option, option, switch
+from servobench.harness.cli.options import NamesOption, ShownOption, named_option, option, switch
 from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, writing_together
@@ -31,12 +31,8 @@ def figures(
     kind: Annotated[
         str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")
     ] = "all",
-    controllers: Annotated[
-        str, option("NAMES", "Comma-separated names; default: all of the folder.")
-    ] = "all",
-    names: Annotated[
-        str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")
-    ] = "",
+    controllers: ShownOption = "all",
+    names: NamesOption = "",
     width: Annotated[
         str, option("LENGTH", "Width of a column of a paper, such as 252pt, 89mm or 3.5in.")
     ] = "7.2in",
@@ -68,17 +64,11 @@ def figures(
     opened.check_runs(runs)
     known = list(dict.fromkeys(runs["controller"]))
     shown = selection.split_names("controllers", controllers, known)
-    own = [name.strip() for name in names.split(",")] if names else shown
-    if len(own) != len(shown):
-        raise ConfigurationError(
-            f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}"
-        )
-    if len(set(own)) < len(own):
-        raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
+    labels = selection.split_labels(names, shown)
     if "pgf" in formats:
         check_tex()
     say(opened.describe_missing())
-    choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
+    choice = Choice(kinds, labels, Layout.of_width(width), title)
     target = out or folder / FOLDER
     files = []
     with (
