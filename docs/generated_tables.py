@@ -58,7 +58,7 @@ from servobench.harness.config import registry
 from servobench.harness.config.description import describe_settings, toml
 from servobench.harness.config.installation import CODE_FOLDERS
 from servobench.harness.config.settings import flatten
-from servobench.harness.run.metrics import METRICS
+from servobench.harness.run.metrics import BUILT_IN
 from servobench.plant.contract.settings import STORED_STRINGS, strings_in
 
 ROOT = Path(__file__).parents[1]
@@ -415,7 +415,7 @@ def in_brief(method: Any) -> str:  # noqa: ANN401 - a function
 
 def metrics_table() -> str:
     """Return the table of the metrics of a run."""
-    rows = [(f"`{metric.column}`", metric.meaning) for metric in METRICS.values()]
+    rows = [(f"`{metric.column}`", metric.meaning) for metric in BUILT_IN.values()]
     return table(("column", "definition"), rows)
 
 

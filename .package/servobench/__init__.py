@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from servobench.harness.apps.check.controllers import check_controller
     from servobench.harness.apps.check.plants import check_plant
     from servobench.harness.batch.api import Results, compare, load, run
+    from servobench.harness.run.own_metrics import metric
     from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting
     from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
     from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
@@ -45,6 +46,7 @@ __all__ = [
     "check_plant",
     "compare",
     "load",
+    "metric",
     "run",
 ]
 
@@ -54,6 +56,7 @@ _HOMES = {
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.apps.check.controllers": ("check_controller",),
     "servobench.harness.apps.check.plants": ("check_plant",),
+    "servobench.harness.run.own_metrics": ("metric",),
     "servobench.harness.run.scenario": ("Scenario", "Task", "TaskEntry", "TaskSetting"),
     "servobench.plant.bench.plant": ("Plant", "PlantEntry", "PlantSetup", "World"),
     "servobench.plant.contract.signals": ("Command", "Observation", "PlantSpec", "Truth"),

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from servobench.harness.config.registry import CONTROLLERS, find_controller
+from servobench.harness.config.registry import CONTROLLERS, DECLARED, find_controller
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import (
     ACHIEVED,
@@ -77,8 +77,9 @@ class Estimate:
         return f"{number(self.value, spec)} [{number(self.low, spec)}, {number(self.high, spec)}]"
 
     def scaled(self, factor: float) -> Estimate:
-        """Return the estimate in another unit."""
-        return Estimate(factor * self.value, factor * self.low, factor * self.high, self.count)
+        """Return the estimate in another unit, or with the other sign."""
+        low, high = sorted((factor * self.low, factor * self.high))
+        return Estimate(factor * self.value, low, high, self.count)
 
 
 NO_ESTIMATE: Final = Estimate(np.nan, np.nan, np.nan, 0)
@@ -499,12 +500,17 @@ def margin(name: str, runs: pd.DataFrame) -> float:
 
     For a time that is one control period; for an error 0.2 mm, as a share of the settling band, or a tenth of the
     median of the best controller that knows the robot if that is more; for a share or ratio 0.01; else a tenth of the
-    median that is nearest to zero.
+    median that is nearest to zero. A metric of a user's may declare its own.
     """
-    unit = METRICS[name].unit if name in METRICS else "unknown"
+    unit = "unknown"
+    if name in METRICS:
+        unit = METRICS[name].unit
+        declared = METRICS[name].margin
+        if declared is not None:
+            return declared
     if unit == "s":
         return float(column_of(runs, "period_s").fillna(RunSettings.period).max())
-    if unit == "1":
+    if unit == "1" and name not in DECLARED:
         return SHARE_MARGIN
     if unit:
         medians = column_of(runs, name).groupby(runs["controller"]).median().abs()
@@ -515,6 +521,13 @@ def margin(name: str, runs: pd.DataFrame) -> float:
     band = column_of(runs, "settling_band").max()
     larger = np.fmax(ERROR_MARGIN * band, BOUND_MARGIN * best)  # either may be unknown, NaN
     return float(np.nan_to_num(larger))
+
+
+def direction(metric: str) -> float:
+    """Return 1, or -1 for a metric of which more is better."""
+    if metric in METRICS and METRICS[metric].better == "more":
+        return -1.0
+    return 1.0
 
 
 def knows_truth(name: str) -> bool:
@@ -536,7 +549,7 @@ def compare_pairs(
     Args:
         runs: the table of runs.
         pairs: names of controllers, two and two.
-        metric: the column compared, less is better; a run that has no value or did not complete is lost.
+        metric: the column compared, negated if more is better; a run that has no value or did not complete is lost.
         keys: columns that two runs of a pair share.
 
     Raises:
@@ -550,7 +563,7 @@ def _paired_values(
     runs: pd.DataFrame, pair: tuple[str, str], metric: str, keys: Sequence[str]
 ) -> tuple[pd.Series[float], pd.Series[float]]:
     """Return the values of two controllers on the runs that they share, by the keys of these; NaN of lost ones."""
-    values = column_of(runs, metric).where(runs["status"] == COMPLETED)
+    values = direction(metric) * column_of(runs, metric).where(runs["status"] == COMPLETED)
     index = pd.MultiIndex.from_frame(runs[list(keys)])
     indexed = pd.Series(values.to_numpy(), index=index)
     first = indexed[(runs["controller"] == pair[0]).to_numpy()]

@@ -11,6 +11,7 @@ from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS, MAPPED
 from servobench.harness.config.settings import tuned_settings
 from servobench.harness.config.source import find_place
+from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.settings import listed
@@ -44,7 +45,11 @@ def _made(manifest: Mapping[str, Any]) -> str:
 
 
 def titled_runs(folder: ResultsFolder) -> pd.DataFrame:
-    """Return a folder's runs for titles: the mismatch none of robots drawn from a twin says so."""
+    """Return a folder's runs for titles: the mismatch none of robots drawn from a twin says so.
+
+    Metrics of users that the folder has are known from now on.
+    """
+    declare_metrics(folder.manifest.get("own_metrics") or {})
     runs = folder.runs()
     robots = folder.manifest.get("robots") or ()
     twins = [each.get("name") for each in robots if str(each.get("title")).endswith(" twin")]

@@ -27,6 +27,7 @@ from servobench.harness.analysis.comparison import (
     achievement,
     column_of,
     compare_pairs,
+    direction,
     grouped,
     holm,
     in_handy_units,
@@ -60,6 +61,7 @@ from servobench.harness.run.outcome import (
     SETTLED,
     TARGET_UNREACHABLE,
 )
+from servobench.harness.run.own_metrics import GROUP
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import TASKS
@@ -163,7 +165,9 @@ class Statistics(NamedTuple):
     def family(self) -> str:
         """The number of verdicts shown, over which p-values are corrected, and that of the folder."""
         shown = sum(len(place.pairs) for place in self.places)
-        verdicts = "verdict" if shown == 1 else "verdicts"
+        verdicts = "verdicts"
+        if shown == 1:
+            verdicts = "verdict"
         return f"{shown} {verdicts} shown, {self.verdicts} in this folder"
 
     @property
@@ -193,9 +197,8 @@ class PValue:
     holm: float
 
     def __format__(self, spec: str) -> str:
-        """Return both, each formatted with `spec`; below a thousandth only that."""
-        both = [format(p, spec) if p >= 0.001 else "<0.001" for p in (self.p, self.holm)]
-        return "{} ({})".format(*both)
+        """Return both, each formatted with `spec`, of which .3f says no more than <0.001."""
+        return f"{self.p:{spec}} ({self.holm:{spec}})".replace("0.000", "<0.001")
 
 
 def judge_places(runs: pd.DataFrame, selection: Selection | None = None) -> Statistics:
@@ -255,9 +258,12 @@ def _pairs(
 ) -> list[tuple[str, str]]:
     """Return pairs of some controllers of a place, those that share a seed: a batch may be unfinished."""
     seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller")}
-    pairs = combinations([name for name in names if name in seeds], 2)
-    found = [pair for pair in pairs if against in (None, *pair) and seeds[pair[0]] & seeds[pair[1]]]
-    return [pair if pair[1] != against else pair[::-1] for pair in found]
+    known = [name for name in names if name in seeds]
+    known.sort(key=lambda name: name != against)  # so that it is the first one of its pairs
+    pairs = combinations(known, 2)
+    return [
+        pair for pair in pairs if against in (None, pair[0]) and seeds[pair[0]] & seeds[pair[1]]
+    ]
 
 
 def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str, str]:
@@ -277,15 +283,17 @@ def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str
             f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}"
         )
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
-    unit, factor = "1", 1.0  # a column that is no metric
+    unit, factor, digits = "1", 1.0, 2  # a column that is no metric
     heading = metric.replace("_", " ")
     words = {"better": "less", "worse": "more"}  # nobody knows whether less of it is better
     if metric in METRICS:
         unit, factor = shown_unit(metric, runs)
         heading = metric_heading(metric, runs)
+        digits = max(digits, METRICS[metric].digits)
         if METRICS[metric].better:
             words = {}
     better = words.get("better", "better")
+    sign = direction(metric)
     rows = []
     for (first, second), each in zip(pairs, compared, strict=True):
         lost_first, lost_second = each.lost
@@ -295,7 +303,7 @@ def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str
         row = {
             PAIR: Cell(f"{selection.names[first]} − {selection.names[second]}"),
             "runs lost": Cell(f"{lost_first} : {lost_second}"),
-            f"{DIFFERENCE} in {heading}": Cell(each.mean.scaled(factor), ".2f"),
+            f"{DIFFERENCE} in {heading}": Cell(each.mean.scaled(sign * factor), f".{digits}f"),
             "verdict": Cell(verdict),
             f"P(A {better})": Cell(each.probability, ".2f"),
             P_VALUE: Cell(each.p_value),
@@ -462,10 +470,10 @@ WHICH: Final = ""  # the group of columns that say which runs a row is about
 CONDITIONS: Final = ("plant", "robot", "sensing", "mismatch")  # with the settings that are varied
 # Table -> groups of columns in order; a metric says in which of them it is
 GROUPS: Final = {
-    "moves": ("Time", "Error", "Motion"),
-    "curves": ("RMS error", "Motion"),
+    "moves": ("Time", "Error", "Motion", GROUP),
+    "curves": ("RMS error", "Motion", GROUP),
     "cost": ("Step of the controller", "Joints", "Estimate"),
-    "runs": ("Time", "Error", "Motion"),
+    "runs": ("Time", "Error", "Motion", GROUP),
 }
 MEANINGS: Final = {
     NOT_SETTLED: "the true error did not come into the settling band, or left it again",

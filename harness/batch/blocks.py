@@ -50,6 +50,7 @@ from servobench.harness.batch.processes import Bounds, Limits, available_process
 from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile, check_present_folder
 from servobench.harness.run import episode
+from servobench.harness.run.own_metrics import METRIC_REGISTRY
 from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import COMPLETED, CRASHED, LOST, Ending, RunResult, ends_batch
@@ -77,16 +78,17 @@ class Job:
     kind: Hashable | None = (
         None  # runs of one kind may advance together; None: the run goes by itself
     )
+    metrics: tuple[str, ...] = ()  # metrics of users, which are computed of its steps
 
     @property
     def owner(self) -> str:
-        """Whose code the run carries out: the names of its plant and controller; empty for that of this package."""
+        """Whose code the run carries out: names of plant, controller and metrics; empty for that of this package."""
         plant, controller = self.cell.request.plant, self.cell.request.controller
         foreign = registry.is_foreign_plant(
             plant, trusted=not getattr(self.run.plant, "isolate", True)
         )
-        if foreign or registry.is_foreign_controller(controller):
-            return f"{plant} {controller}"
+        if foreign or self.metrics or registry.is_foreign_controller(controller):
+            return " ".join((plant, controller, *self.metrics))
         return ""
 
 
@@ -336,8 +338,14 @@ def _carry_out(
             tell(_with_columns(job.cell, result))
         for job in block.jobs[len(together) :]:
             try:
+                metrics = [METRIC_REGISTRY.find(name) for name in job.metrics]
                 result = episode.carry_out(
-                    job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug
+                    job.run,
+                    steps=steps,
+                    picture=job.cell.picture,
+                    keep=keep,
+                    debug=debug,
+                    metrics=metrics,
                 )
             except BaseException as error:
                 if debug or ends_batch(error):
@@ -504,6 +512,7 @@ def open_workers(
         return
     foreign = any(registry.is_foreign_plant(name, trusted=name in trusted) for name in plants)
     foreign = foreign or any(map(registry.is_foreign_controller, controllers))
+    foreign = foreign or any(each.word == "metric" for each in own)
     limits = bounds.limits(count, foreign=foreign and bounds.isolate and registry.can_travel(own))
     if count == 1 and limits == Limits():
         yield Workers()

@@ -69,6 +69,7 @@ class Campaign:
     settings: Settings  # overrides of the defaults
     steps: bool = False  # keep the table of steps, too
     timed: bool = False  # each run goes by itself, so that its steps have times
+    metrics: tuple[str, ...] = ()  # names of metrics of users; each run goes by itself, too
 
 
 def comparison(batch: Batch, settings: Settings) -> Campaign:
@@ -137,7 +138,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         raise ConfigurationError(
             f"a batch of {runs.count} runs has at most {runs.count} parts, got {how.part[1]}"
         )
-    own = offered(runs.sections)
+    own = offered([*runs.sections, *campaign.metrics])
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
     trusted = [
@@ -175,7 +176,8 @@ def _carry_out_at(
 ) -> None:
     """Check and carry out a campaign at a place."""
     sections = check_campaign(campaign, runs, how.observer, place)
-    together = how.block > 1 and not (how.debug or campaign.steps or campaign.timed)
+    alone = how.debug or campaign.steps or campaign.timed or campaign.metrics
+    together = how.block > 1 and not alone
     jobs = partial(_jobs, campaign, sections, together)
     side_by_side = (
         _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
@@ -253,9 +255,8 @@ def _jobs(
     for index in indices:
         cell = campaign.cells[index]
         run = select(cell.request, sections)
-        yield Job(
-            index, cell, run, side_by_side_key(run) if together and not cell.picture else None
-        )
+        kind = side_by_side_key(run) if together and not cell.picture else None
+        yield Job(index, cell, run, kind, campaign.metrics)
 
 
 def _side_by_side(runs: Iterable[ResolvedRun]) -> dict[str, list[str]]:

@@ -21,6 +21,7 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
+from servobench.harness.run.own_metrics import OwnMetric
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
@@ -31,7 +32,12 @@ PACKAGES = (
     "opencv-python-headless",
 )  # fmt: skip
 # Keys of code of users, by kind
-OWN = {"controller": "own_controllers", "plant": "own_plants", "task": "own_tasks"}
+OWN = {
+    "controller": "own_controllers",
+    "plant": "own_plants",
+    "task": "own_tasks",
+    "metric": "own_metrics",
+}
 
 
 def _seeds_word(seeds: range) -> str:
@@ -55,15 +61,17 @@ def describe_batch(
         sections: their typed settings by section, as `servobench.harness.run.resolution.resolve_sections` returns them.
         changed: overrides of the defaults by section.
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
-        own: controllers and plants that users gave.
+        own: controllers, plants, tasks and metrics that users gave.
         steps: the table of steps is kept, too.
     """
     configuration = {name: flatten(config) for name, config in sections.items()}
     commit, unknown = read_checkout()
-    identity = json.dumps([runs.digest, configuration, steps], sort_keys=True, default=str)
+    metrics = {each.name: each.entry.record() for each in own if isinstance(each.entry, OwnMetric)}
+    parts = [runs.digest, configuration, steps, *sorted(metrics)]
+    identity = json.dumps(parts, sort_keys=True, default=str)
     given: dict[str, dict[str, Any]] = {key: {} for key in OWN.values()}
     for offer in own:
-        given[OWN[offer.word]][offer.name] = offer.record()
+        given[OWN[offer.word]][offer.name] = {**metrics.get(offer.name, {}), **offer.record()}
     tuned = {offer.name: offer.tuned for offer in own if offer.tuned}
     engines = {}
     for name in runs.plants:

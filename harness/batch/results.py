@@ -64,10 +64,12 @@ class ResultsFolder:
 
     Attributes:
         path: of the folder.
+        added: columns that the table of runs gets when it is read, as name -> run_id -> value.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.added: dict[str, dict[str, float]] = {}
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
@@ -117,7 +119,7 @@ class ResultsFolder:
         if isinstance(period, float):  # the period of all runs where no sweep varies it
             runs["period_s"] = runs["period_s"].fillna(period) if "period_s" in runs else period
         refuse_nameless(first, runs)
-        return runs
+        return runs.assign(**{name: runs["run_id"].map(own) for name, own in self.added.items()})
 
     def iterate_runs(self, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
         """Yield the table of runs of a finished batch, some thousand rows at a time and those of `columns` it has."""

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from servobench.harness.run.metrics import METRICS
+from servobench.harness.run.metrics import BUILT_IN
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import SHORT_NAMES
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
@@ -264,7 +264,7 @@ TEXTS: Final = frozenset(
 )  # fmt: skip
 WHOLE: Final = frozenset(("seed", "periods"))
 NUMBERS: Final = frozenset(
-    {"settling_band", *WHOLE, *METRICS, *(short.column for short in SHORT_NAMES.values())}
+    {"settling_band", *WHOLE, *BUILT_IN, *(short.column for short in SHORT_NAMES.values())}
 )
 # And 0 is the least
 MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}

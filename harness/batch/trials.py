@@ -12,7 +12,13 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
-from servobench.harness.config.registry import MAPPED, REGISTRIES, find_controller, installed_plant
+from servobench.harness.config.registry import (
+    MAPPED,
+    REGISTRIES,
+    Registry,
+    find_controller,
+    installed_plant,
+)
 from servobench.harness.config.source import count_as_users, find_place, place_in_trace
 from servobench.harness.run.result import LOST, TIMED_OUT, Ending
 from servobench.plant.contract.faults import ConfigurationError
@@ -23,7 +29,9 @@ if TYPE_CHECKING:
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
 
-Word: TypeAlias = Literal["controller", "plant"]
+PLACES = frozenset(("axis", "magnitude", "unit"))  # columns of sweeps
+
+Word: TypeAlias = Literal["controller", "plant", "metric"]
 
 
 class Tried(NamedTuple):
@@ -111,7 +119,7 @@ def _attempt_here(
 
 
 def choose(word: Word, given: str) -> str:
-    """Return the name of a controller or plant; code of users that it names is imported in an isolated process first.
+    """Return the name of a controller, plant or metric; code of users is imported in an isolated process first.
 
     Args:
         word: the kind.
@@ -120,7 +128,7 @@ def choose(word: Word, given: str) -> str:
     Raises:
         ConfigurationError: there is none, or it cannot be used; one line with file and line number.
     """
-    registry = REGISTRIES[word]
+    registry = _registry(word)
     place = None if given.startswith(MAPPED) or given in registry.names() else find_place(given)
     if place is not None and place["module"]:
         count_as_users(place["module"])
@@ -128,11 +136,28 @@ def choose(word: Word, given: str) -> str:
         _, failure = attempt(_choose, word, given, limit=IMPORT_LIMIT)
         if failure:
             raise ConfigurationError(f"{given} cannot be imported: {failure}")
-    return registry.choose(given)
+    name = registry.choose(given)
+    if word == "metric":
+        from servobench.harness.batch.tables import NUMBERS, TEXTS  # noqa: PLC0415 - as above
+
+        if name in NUMBERS | TEXTS | PLACES:
+            raise ConfigurationError(
+                f"--metric: the table of runs has a column {name} already; give yours another name, such as "
+                f"my_{name}={given}"
+            )
+    return name
 
 
 def _choose(word: Word, given: str) -> str:
-    return REGISTRIES[word].choose(given)
+    return _registry(word).choose(given)
+
+
+def _registry(word: Word) -> Registry[Any]:
+    if word == "metric":
+        from servobench.harness.run.own_metrics import METRIC_REGISTRY  # noqa: PLC0415 - pandas
+
+        return METRIC_REGISTRY
+    return REGISTRIES[word]
 
 
 def try_all(word: Word, robot: str) -> list[Tried]:

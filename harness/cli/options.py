@@ -210,6 +210,12 @@ NamesOption = Annotated[
         "Their names here: CONTROLLER=NAME,..., or all in the order of --controllers.",
     ),
 ]
+MetricsOption = Annotated[
+    list[str] | None,
+    named_option(
+        "--metric", "PLACE", "A metric of yours, such as ./mine.py:itae; may be repeated."
+    ),
+]
 JsonOption = Annotated[bool, switch("--json", "Print JSON, for other programs.")]
 DebugOption = Annotated[
     bool,

@@ -41,7 +41,8 @@ def statistics(
         str | None,
         option(
             "COLUMN",
-            "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
+            "Column of the table of runs by which pairs are compared, or a metric of yours, ./mine.py:itae; default: "
+            "settling time, on curves RMS error.",
         ),
     ] = None,
     controllers: ShownOption = "all",
@@ -70,7 +71,9 @@ def statistics(
     )
     from servobench.harness.analysis.latex import latex_tables, methods_paragraph
     from servobench.harness.analysis.tables import Selection, as_plain, judge_places
+    from servobench.harness.batch.measuring import add_metric
     from servobench.harness.batch.results import ResultsFolder
+    from servobench.harness.config.source import find_place
     from servobench.plant.contract.settings import suggest
 
     if markdown + latex + as_json > 1:
@@ -78,6 +81,8 @@ def statistics(
             "--markdown, --latex and --json are ways to print the same; give one of them"
         )
     opened = ResultsFolder(folder)
+    if metric is not None and find_place(metric):
+        metric = add_metric(opened, metric)
     runs = titled_runs(opened)
     opened.check_runs(runs)
     shown = selection.split_names("controllers", controllers, list(runs["controller"].unique()))
@@ -202,6 +207,20 @@ def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
+def print_lacking(folder: ResultsFolder) -> None:
+    """Print in how many completed runs a metric of the user's has no value, and why in the first of them."""
+    from servobench.harness.run.result import COMPLETED
+
+    lacking = []
+    for table in folder.iterate_runs(("run_id", "status", "reason")):
+        lacking += table[(table["status"] == COMPLETED) & (table["reason"] != "")].to_dict(
+            "records"
+        )
+    if lacking:
+        first = lacking[0]
+        say(f"in {len(lacking)} runs, first in {first['run_id']}: {first['reason']}")
+
+
 def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
     """Say how many runs of a batch lack or failed and where their traces are; end with exit code 1 if that counts.
 
@@ -213,6 +232,7 @@ def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
     from servobench.harness.batch.results import FAILURES, missing_line
     from servobench.harness.run.result import COMPLETED
 
+    print_lacking(folder)
     completed = [table["status"] == COMPLETED for table in folder.iterate_runs(("status",))]
     count = sum(map(len, completed))
     failed = sum(int((~each).sum()) for each in completed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -115,6 +116,7 @@ def run(
 def compare(
     *,
     combinations: options.Combinations,
+    metric: options.MetricsOption = None,
     running: options.Batched,
     overrides: options.Overrides,
     out: OutOption = None,
@@ -127,7 +129,9 @@ def compare(
     batch = combinations.batch()
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
-    campaign, how = comparison(batch, overrides.settings()), running.execution()
+    metrics = selection.choose_metrics(metric)
+    campaign = replace(comparison(batch, overrides.settings()), metrics=metrics)
+    how = running.execution()
     _carry_out(
         campaign,
         out,
@@ -154,6 +158,7 @@ def sweep(
     ] = "",
     latency: Annotated[str, option("SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
     period: Annotated[str, option("SECONDS", "Control periods [s]: --vary period=...")] = "",
+    metric: options.MetricsOption = None,
     running: options.Batched,
     overrides: options.Overrides,
 ) -> None:
@@ -176,9 +181,9 @@ def sweep(
 
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
-    campaign = Campaign(
-        SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings()
-    )
+    cells = SweepPlan.parse(combinations.batch(), variations).cells()
+    metrics = selection.choose_metrics(metric)
+    campaign = Campaign(cells, overrides.settings(), metrics=metrics)
     execution = running.execution()
     with watching(console, out, execution) as how:
         carry_out(campaign, out, how)

@@ -12,6 +12,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import split_words
 
 if TYPE_CHECKING:
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.batch.trials import Word
 
 ALL = "all"
@@ -228,6 +229,22 @@ def split_names(
         if names.count(name) > 1:
             raise ConfigurationError(f"--{option} names {name} twice")
     return tuple(names)
+
+
+def choose_metrics(places: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of metrics of the user's, each named by its place once."""
+    from servobench.harness.batch import trials
+
+    return tuple(dict.fromkeys(trials.choose("metric", place) for place in places or ()))
+
+
+def add_metrics(folder: ResultsFolder, places: Sequence[str] | None) -> None:
+    """Add metrics of the user's to the runs of a folder."""
+    if places:
+        from servobench.harness.batch.measuring import add_metric
+
+        for place in places:
+            add_metric(folder, place)
 
 
 def split_labels(text: str, shown: Sequence[str]) -> dict[str, str]:

@@ -184,7 +184,7 @@ class Kind(Generic[Entry]):
     entry: type[Any]
     """its class of entries"""
     bases: tuple[type, ...]
-    """classes below which it may be given"""
+    """classes below which it may be given; empty for functions"""
     wanted: str
     """the accepted objects, in words"""
     of_class: Callable[[type[Any]], Entry]
@@ -511,15 +511,16 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
         return next(iter(found.values()))
     if not found:
         bases = " or ".join(f"servobench.{each.__name__}" for each in kind.bases)
+        lack = f"no subclass of {bases} and no ENTRY"
+        if not kind.bases:
+            lack = kind.wanted
         others = [
             f"the {other.word} {each}"
             for other in (CONTROLLER, PLANT)
             for each in _members(other, module)
         ]
         hint = f"; it defines {' and '.join(others)}" if others else _guard_hint(module)
-        raise ConfigurationError(
-            f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY{hint}"
-        )
+        raise ConfigurationError(f"{where} defines no {kind.word}: {lack}{hint}")
     first, *_ = found
     raise ConfigurationError(
         f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}"

@@ -177,7 +177,9 @@ def read_commit(root: Path) -> str | None:
     """
     if not (root / ".git").exists():
         built = root / COMMIT_FILE
-        return built.read_text(encoding="ascii").strip() if built.is_file() else None
+        if not built.is_file():
+            return None
+        return built.read_text(encoding="ascii").strip()
     commit = _git(root, "rev-parse", "HEAD")
     changed = _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
     return f"{commit}{DIRTY}" if changed else commit

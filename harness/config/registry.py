@@ -53,18 +53,22 @@ MAPPINGS: Final = (".fmu", ".toml")  # endings of an FMU, or of a mapping of its
 
 Offer: TypeAlias = Own[Any]
 _OFFERED: dict[str, Offer] = {}
+DECLARED: Final[
+    dict[str, Any]
+] = {}  # metrics of users by name, as `servobench.harness.run.metrics` declares its own
 
 
 @contextlib.contextmanager
 def offering(given: Iterable[Offer] = ()) -> Iterator[None]:
     """Let controllers and plants be found by name, these and those that are offered within the context."""
-    before = dict(_OFFERED)
+    before, declared = dict(_OFFERED), dict(DECLARED)
     _OFFERED.update((each.name, each) for each in given)
     try:
         yield
     finally:
-        _OFFERED.clear()
-        _OFFERED.update(before)
+        for mapping, former in ((_OFFERED, before), (DECLARED, declared)):
+            mapping.clear()
+            mapping.update(former)
 
 
 def offered(names: Iterable[str]) -> tuple[Offer, ...]:

@@ -22,6 +22,7 @@ from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import final_rows, judge_run
 from servobench.harness.run.outcome import find_outcome, pose_errors
+from servobench.harness.run.own_metrics import OwnMetric, values_of
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, INSTANT, Ending, RunResult, ends_batch
@@ -45,6 +46,7 @@ def carry_out(
     picture: bool = False,
     keep: Path | None = None,
     debug: bool = False,
+    metrics: Sequence[OwnMetric] = (),
 ) -> RunResult:
     """Carry one run out; the row's `status` and `reason` name a fault on the way.
 
@@ -54,6 +56,7 @@ def carry_out(
         picture: also return the last picture of the camera, if there is one.
         keep: results folder in which trained networks are kept beside the runs.
         debug: raise an error that is no `RunFault` instead of noting it.
+        metrics: of users, that are columns of the row, too; one that fails says so in its `reason`.
 
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
@@ -78,11 +81,13 @@ def carry_out(
         keep_networks(experiment.networks, keep)
     pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
     row = _row(experiment.drawn, resolved, ending, _judge(logged, experiment), logged, pose)
-    table = None
-    if steps:
-        table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(
-            **pose
-        )
+    if steps or metrics:
+        table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian)
+        table = table.assign(**pose)
+        values, fault = values_of(metrics, table, debug=debug)
+        row |= {**values, "reason": row["reason"] or fault}
+    if not steps:
+        return RunResult(row, None, image, ending.trace)
     return RunResult(row, table, image, ending.trace)
 
 

@@ -6,6 +6,7 @@ report are made from the declarations. All errors are those of the true feature.
 """
 
 import math
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
@@ -13,6 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from servobench.harness.config.registry import DECLARED
 from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.harness.run.scenario import Span
@@ -97,10 +99,13 @@ class Metric:
     values: Callable[[Judged], FloatArray] | None = None
     kind: TaskKind | None = None  # kind of the tasks that have it; None for all
     percent: bool = False  # whether it is shown in percent
-    better: str = "less"  # `less`, or empty where neither direction is better
+    better: str = "less"  # `less`, `more`, or empty where neither direction is better
+    margin: float | None = (
+        None  # [unit] difference that does not matter; None for the usual one of the unit
+    )
     # the tables of the report that show it, each with the group of columns: moves, curves, cost, runs
     tables: Mapping[str, str] = field(default_factory=dict)
-    figure: str = ""  # the figure that shows it for each run: settling, effort or smoothness
+    figure: str = ""  # the figure that shows it for each run: settling, effort, smoothness or own
     summary: Summary | None = None  # its column in the table that a command prints at its end
 
 
@@ -127,7 +132,7 @@ def judge_run(
     run = Judged(steps, kind, evaluate_from, lap_time, moves)
     return {
         name: metric.values(run)
-        for name, metric in METRICS.items()
+        for name, metric in BUILT_IN.items()
         if metric.values is not None and metric.kind in (None, kind)
     }
 
@@ -465,5 +470,7 @@ _ALL: Final = (
         tables={"moves": "Error"},
     ),
 )  # fmt: skip
-METRICS: Final = {metric.column: metric for metric in _ALL}
-"""Every metric by the name of its column, in the order of the table of runs."""
+BUILT_IN: Final = {metric.column: metric for metric in _ALL}
+"""Every metric of this package by the name of its column, in the order of the table of runs."""
+METRICS: Final[Mapping[str, Metric]] = ChainMap(DECLARED, BUILT_IN)
+"""The same, and then those of users that the present command knows."""

@@ -41,6 +41,7 @@ ONLY_READ = {
 }
 # Files of the reader
 OWN = (
+    "mine.py",
     "my_ur10e.yaml",
     "my_world.toml",
     "my_arm.urdf",

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import NamesOption, ShownOption, named_option, option, switch
+from servobench.harness.cli.options import (
+    MetricsOption,
+    NamesOption,
+    ShownOption,
+    named_option,
+    option,
+    switch,
+)
 from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, writing_together
@@ -33,6 +40,7 @@ def figures(
     ] = "all",
     controllers: ShownOption = "all",
     names: NamesOption = "",
+    metric: MetricsOption = None,
     width: Annotated[
         str, option("LENGTH", "Width of a column of a paper, such as 252pt, 89mm or 3.5in.")
     ] = "7.2in",
@@ -60,6 +68,7 @@ def figures(
     formats = selection.split_names("format", format_, ALL_FORMATS)
     kinds = selection.split_names("kind", kind, tuple(KINDS))
     opened = ResultsFolder(folder)
+    selection.add_metrics(opened, metric)
     runs = opened.runs()
     opened.check_runs(runs)
     known = list(dict.fromkeys(runs["controller"]))

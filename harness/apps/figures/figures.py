@@ -78,6 +78,7 @@ KINDS: Final = {
     "settling": Kind("Settling time of each run, and its error at the end", EACH),
     "effort": Kind("Control effort and saturation of each run", EACH, in_page=False),
     "smoothness": Kind("How smoothly each run drives the joints", EACH),
+    "own": Kind("Own metrics of each run", EACH),
     "step_times": Kind("Step of the controller", EACH),
     "joint_speeds": Kind("Commanded motion of the joints", FIRST, in_page=False),
 }

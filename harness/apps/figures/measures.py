@@ -38,7 +38,7 @@ from servobench.plant.contract.checks import FloatArray
 
 SETTLING: Final = "settling_time_s"
 NEVER: Final = 1.3  # [1] place of a run that never settled, over the largest settling time
-FIGURES: Final = ("settling", "effort", "smoothness")  # each shows the metrics that name it
+FIGURES: Final = ("settling", "effort", "smoothness", "own")  # each shows the metrics that name it
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic

@@ -8,7 +8,8 @@ from typing import Annotated, Final
 
 import typer
 
-from servobench.harness.cli.options import option
+from servobench.harness.cli import selection
+from servobench.harness.cli.options import MetricsOption, option
 from servobench.harness.cli.terminal import console, say
 
 SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
@@ -21,6 +22,7 @@ def report(
     out: Annotated[
         Path | None, option("FILE", "The page; default: report.html in the folder.")
     ] = None,
+    metric: MetricsOption = None,
 ) -> None:
     """Write one page about a results folder.
 
@@ -30,6 +32,7 @@ def report(
     from servobench.harness.batch.results import ResultsFolder
 
     opened = ResultsFolder(folder)
+    selection.add_metrics(opened, metric)
     say(opened.describe_missing())
     began = time.monotonic()
     with console.status("making the report"):

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import PLANT, Value, option
-from servobench.harness.cli.results import judge
+from servobench.harness.cli.results import judge, print_lacking
 from servobench.harness.cli.selection import Names, accepted
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say
 from servobench.plant.contract.files import split_words
@@ -91,6 +91,7 @@ def suite(
             "COUNT", "Robots on which references run and scores are given; default: all.", min=1
         ),
     ] = None,
+    metric: options.MetricsOption = None,
     running: options.Running,
     overrides: options.Overrides,
 ) -> None:
@@ -113,9 +114,12 @@ def suite(
     names = selection.split("controllers", controllers)
     where = selection.split("plants", plants) if plants else ()
     robots = parse_seeds(seeds)
+    metrics = selection.choose_metrics(metric)
     runs = {world.name: world.cells(where, names, robots, reference_seeds) for world in worlds}
     with watching(console, out, running.execution()) as how:
-        judged = carry_out_suite(out, worlds, runs, overrides.settings(), how)
+        judged = carry_out_suite(out, worlds, runs, overrides.settings(), how, metrics)
+    for world in worlds:
+        print_lacking(ResultsFolder(out / world.name))
     manifest = ResultsFolder(out / worlds[0].name).manifest
     shown = mark_tuned(judged, manifest)
     print_tables(suite_tables(shown), "score: reference over method, at most 1; 0 for a lost run")

@@ -30,8 +30,11 @@ from servobench.harness.apps.studies.challenge import MEASURES, Challenge
 from servobench.harness.apps.studies.scores import profile, ranking, resolution, scores
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
+from servobench.harness.config.registry import DECLARED, offered
 from servobench.harness.config.settings import Settings
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
+from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.request import UNFIT_FOR_FILES
 from servobench.harness.run.resolution import check_settings, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
@@ -53,6 +56,7 @@ def carry_out_suite(
     runs: Mapping[str, Sequence[Run]],
     settings: Settings,
     how: Execution,
+    metrics: tuple[str, ...] = (),
 ) -> pd.DataFrame:
     """Carry out the runs of challenges, judge them, write tables and pictures, and return the judged runs.
 
@@ -62,6 +66,7 @@ def carry_out_suite(
         runs: of each challenge by its name, references included.
         settings: overrides of the defaults of methods and worlds.
         how: how the runs are carried out.
+        metrics: names of metrics of users, which are shown beside the scores.
 
     Raises:
         ConfigurationError: settings that nothing reads or that a challenge fixes, or as `carry_out_parts`.
@@ -76,7 +81,9 @@ def carry_out_suite(
     sections = resolve_sections(requests, whole)
     for request in requests:
         select(request, sections)  # all challenges are checked before the first one runs
-    tables = carry_out_parts({name: Campaign(own, whole) for name, own in runs.items()}, out, how)
+    campaigns = {name: Campaign(own, whole, metrics=metrics) for name, own in runs.items()}
+    tables = carry_out_parts(campaigns, out, how)
+    declare_metrics({each.name: each.entry.record() for each in offered(metrics)})
     parts = [judge(challenge, tables[challenge.name]) for challenge in challenges]
     judged = pd.concat(parts, ignore_index=True)
     write_csv(judged, out / RUNS)
@@ -121,6 +128,7 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
         value=value,
         reference=reference,
         score=np.where(has_reference, scores(value, reference, floor), np.nan),
+        **{name: column_of(runs, name) for name in DECLARED},
     )
 
 
@@ -161,6 +169,8 @@ def methods_rows(judged: pd.DataFrame) -> list[Row]:
                 "lost": Cell(100.0 - good.value, ".0f"),
                 "score": Cell(float(score), ".2f"),
             }
+            for metric in DECLARED:
+                row[metric] = Cell(float(own[metric].median()), f".{METRICS[metric].digits}f")
             rows.append(row)
     return rows
 
@@ -204,6 +214,7 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             "median": f"median, {measure.unit}",
             "lost": "lost, %",
             "score": "score",
+            **{name: f"{name}, {METRICS[name].unit}" for name in DECLARED},
         }
         title = f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}"
         yield title, place[list(headings)].rename(columns=headings)
