@@ -13,19 +13,22 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from numbers import Real
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal, NoReturn, TypeAlias
 
 import pandas as pd
 
 from servobench.harness.config.entries import Kind
 from servobench.harness.config.registry import DECLARED, Registry
-from servobench.harness.run.metrics import Metric, Summary
+from servobench.harness.run.metrics import BUILT_IN, Metric, Summary
 from servobench.harness.run.result import Ending, WrongAnswer, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.settings import NonNegative, Periods, settings
+from servobench.plant.contract.settings import NonNegative, settings
 
 GROUP: Final = "Own"  # columns in tables of the report, and kind of figure
 TABLES: Final = ("moves", "curves", "runs")  # tables of the report
+
+
+Digits: TypeAlias = Literal[0, 1, 2, 3, 4, 5, 6]
 
 
 @settings
@@ -38,7 +41,7 @@ class Declaration:
     """which is better; empty where neither is"""
     margin: NonNegative | None = None
     """[unit] difference that does not matter; None for the usual one of its unit"""
-    digits: Periods = 3
+    digits: Digits = 3
     """behind the decimal point"""
 
 
@@ -85,7 +88,7 @@ def metric(
     unit: str,
     better: Literal["less", "more", ""] = "less",
     margin: float | None = None,
-    digits: int = 3,
+    digits: Digits = 3,
 ) -> Callable[[Callable[[pd.DataFrame], float]], OwnMetric]:
     """Declare a function of the steps of a run as a metric, for the option `--metric FILE.py:NAME`.
 
@@ -93,7 +96,7 @@ def metric(
         unit: of the returned number; empty for that of the features.
         better: which is better, "less" or "more"; empty where neither is.
         margin: difference that does not matter [unit]; None for the usual one of its unit.
-        digits: behind the decimal point where it is shown.
+        digits: behind the decimal point where it is shown, up to 6.
 
     Raises:
         ConfigurationError: a wrong argument.
@@ -137,8 +140,10 @@ def declare_metrics(records: Mapping[str, Mapping[str, Any]]) -> None:
         records: of the manifest, by name; the other entries of a record are of the code.
 
     Raises:
-        ConfigurationError: a record that declares none.
+        ConfigurationError: a record that declares none, or one of this package.
     """
+    if taken := BUILT_IN.keys() & records.keys():
+        raise ConfigurationError(f"own metric {min(taken)}: servobench has one of this name")
     for name, record in records.items():
         known: dict[str, Any] = {
             key: record.get(key) for key in ("unit", "better", "margin", "digits")

@@ -245,11 +245,20 @@ def test_a_verdict_goes_by_the_direction_that_is_declared(faster, better, verdic
     assert "speed" not in METRICS
 
 
-def test_a_folder_that_declares_nonsense_is_refused():
-    with offering(), pytest.raises(ConfigurationError, match="own metric m: margin must be"):
-        own_metrics.declare_metrics(
-            {"m": {"unit": "s", "better": "less", "margin": -1.0, "digits": 1}}
-        )
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("m", {"margin": -1.0}, "own metric m: margin must be at least 0"),
+        ("m", {"digits": 10**9}, "own metric m: digits must be one of 0, 1"),
+        ("m", {"unit": None}, "own metric m: unit must be"),
+        ("overshoot", {}, "own metric overshoot: servobench has one of this name"),
+    ],
+)
+def test_a_folder_that_declares_nonsense_is_refused(name, change, words):
+    record = {"unit": "s", "better": "less", "digits": 1} | change
+    with offering(), pytest.raises(ConfigurationError, match=words):
+        own_metrics.declare_metrics({name: record})
+    assert METRICS["overshoot"].unit == "1"
 
 
 def test_a_metric_goes_to_other_processes_under_the_name_that_it_was_given(files):
