@@ -9,6 +9,8 @@ def main() -> None:
     # Imports make lasting objects only: the collector would visit them again and again
     gc.set_threshold(50_000)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Pydantic would look for plug-ins of its own in every installed distribution
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     from servobench.harness.cli.main import main as command
 
     command()

@@ -10,7 +10,6 @@ may have suffered from an earlier one in the same process. As a block is never s
 costs at most the time of the runs once more. The one module that imports Dask.
 """
 
-import asyncio
 import contextlib
 import json
 import logging
@@ -538,6 +537,8 @@ def _open_cluster(scheduler: str) -> Iterator[Executor]:
         raise ConfigurationError(
             f"--scheduler needs an address such as tcp://127.0.0.1:8786, got {scheduler!r}"
         )
+    import asyncio  # noqa: PLC0415 - a batch on this machine does without
+
     from distributed import Client  # noqa: PLC0415 - only the extra cluster brings it
 
     # It reports the end of a scheduler with traces

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 import pandas as pd
-import pyarrow.dataset as ds
+import pyarrow.compute as pc
 
 from servobench.harness.batch import tables
 from servobench.harness.batch.lock import LOCK, PARTS, refuse_links
@@ -144,7 +144,7 @@ class ResultsFolder:
         names = self._intact(STEPS)
         for name in names:
             refuse_lacking(self.path / name, "steps", tables.common_schema(self.path, [name]))
-        only = None if run_ids is None else ds.field("run_id").isin(run_ids)
+        only = None if run_ids is None else pc.field("run_id").isin(run_ids)
         steps = tables.read_tables(self.path, names, only, columns)
         if steps.empty:
             raise ConfigurationError(

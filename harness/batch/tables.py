@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
-import pyarrow.dataset as ds
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from servobench.harness.run.metrics import BUILT_IN
@@ -140,7 +140,7 @@ def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
 def read_tables(
     folder: Path,
     names: Sequence[str],
-    only: ds.Expression | None = None,
+    only: pc.Expression | None = None,
     columns: Collection[str] | None = None,
 ) -> pd.DataFrame:
     """Return the rows of tables, one below the other.

@@ -51,7 +51,7 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
 )
-from pydantic.dataclasses import dataclass
+from pydantic.dataclasses import dataclass, rebuild_dataclass
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
 from servobench.plant.contract.checks import FloatArray
@@ -189,14 +189,21 @@ STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 def settings(kind: Class) -> Class:
     """Make a class a frozen dataclass whose fields are checked on construction.
 
-    Construction raises a `ValueError` of one line that names the field, the wanted and the given value.
+    Construction raises a `ValueError` of one line that names the field, the wanted and the given value. The checks are
+    built with the first construction, as a command constructs few classes; those of a local class at once, as the names
+    in its types are gone later.
     """
-    checked: Any = dataclass(frozen=True, config=STRICT)(kind)
+    is_local = "<locals>" in kind.__qualname__
+    config = ConfigDict(**STRICT, defer_build=not is_local)
+    checked: Any = dataclass(frozen=True, config=config)(kind)
     construct = checked.__init__
     names = [item.name for item in fields(checked)]
 
     @wraps(construct)
     def construct_checked(self: Any, *arguments: Any, **values: Any) -> None:  # noqa: ANN401 - any field
+        if not checked.__pydantic_complete__:
+            rebuild_dataclass(checked)
+            checked.__init__ = construct_checked
         try:
             # By name, so that a complaint names the field and not the number of an argument.
             named = dict(zip(names, arguments, strict=False))
