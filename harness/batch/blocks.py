@@ -18,16 +18,18 @@ import pickle
 import re
 import sys
 import threading
+import time
 import zlib
 from base64 import b64decode, b64encode
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
+from functools import partial
 from io import BytesIO
 from itertools import groupby, islice
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, Final, Self
 
 import numpy as np
@@ -165,7 +167,11 @@ def carry_out_blocks(
         if not under_way:
             again.append(suspects.popleft())  # alone: a worker may die of any of its tasks
             continue
-        block, future = finished.get()
+        try:
+            block, future = finished.get(timeout=LOOK_EVERY)
+        except Empty:
+            workers.check()
+            continue
         under_way -= 1
         done, rest = _outcome(block, future, workers)
         for each in rest:
@@ -187,10 +193,8 @@ def _outcome(
             return [_failed(job, Ending(status, reason, trace)) for job in block.jobs], []
     done, end = list[RunResult](), answer.end
     try:
-        done.extend(
-            unpack_result(job, item) for job, item in zip(block.jobs, answer.items, strict=False)
-        )
-    except (ValueError, RecursionError) as error:
+        done.extend(_unpacked(block.jobs, answer.items))
+    except (TypeError, ValueError, RecursionError) as error:
         reason = f"the answer of the run cannot be read: {error}"
         end = End(Ending(CRASHED, reason), certain=False)
     if len(answer.items) > len(block.jobs):
@@ -374,13 +378,88 @@ def pack_result(result: RunResult) -> dict[str, Any]:
             "trace": result.trace}  # fmt: skip
 
 
+def pack_together(items: Sequence[Any]) -> dict[str, Any] | None:
+    """Return answers as one table of columns; None where columns differ, or a run has steps or a picture."""
+    rows = [item["row"] for item in items]
+    if len(set(map(tuple, rows))) > 1 or any(item["steps"] or item["picture"] for item in items):
+        return None
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    return {"columns": columns, "traces": [item["trace"] for item in items]}
+
+
+def _unpacked(jobs: Sequence[Job], items: Sequence[Any]) -> Iterator[RunResult]:
+    """Yield the results of runs from the answers of a worker, one for each run or one table for all of them.
+
+    Raises:
+        ValueError: the next answer is not the result of its run.
+    """
+    match items:
+        case [{"columns": dict(columns), "traces": list(traces)}]:
+            yield from _unpack_together(jobs, columns, traces)
+        case _:
+            for job, item in zip(jobs, items, strict=False):
+                yield unpack_result(job, item)
+
+
+def _unpack_together(
+    jobs: Sequence[Job], columns: Mapping[str, Any], traces: list[Any]
+) -> Iterator[RunResult]:
+    from servobench.harness.batch import consistency  # noqa: PLC0415 - as below
+
+    if not all(isinstance(each, str) for each in traces):
+        raise ValueError("its traces are no texts")
+    _check_columns(jobs, columns)
+    for job, trace, *values in zip(jobs, traces, *columns.values(), strict=True):
+        row = dict(zip(columns, values, strict=True))
+        wrong = consistency.find_contradiction(row, None, job.run.run.period)
+        if wrong:
+            raise ValueError(wrong)
+        yield RunResult(row, None, trace=trace)
+
+
+def _check_columns(jobs: Sequence[Job], columns: Mapping[str, Sequence[Any]]) -> None:
+    """Refuse columns, a value for each of some runs, that are not those of the table of these runs.
+
+    Raises:
+        ValueError: names the first wrong column.
+    """
+    from servobench.harness.batch import tables  # noqa: PLC0415 - pandas, which workers do without
+
+    known = _failed(jobs[0], Ending()).row
+    if missing := known.keys() - columns.keys():
+        raise ValueError(f"it lacks {min(missing)}")
+    wanted_rows = [{**episode.wanted_columns(job.run), **job.cell.columns} for job in jobs]
+    if any(row.keys() != wanted_rows[0].keys() for row in wanted_rows):
+        raise ValueError("its runs have different columns")
+    own = wanted_rows[0].keys() - {"robot"}
+    for name in own:
+        wanted_values = [row[name] for row in wanted_rows]
+        if json.dumps(columns[name]) != json.dumps(wanted_values):  # NaN is NaN, but 1 not 1.0
+            raise ValueError("it is that of another run")
+    kinds = [
+        (name, kind, type(known.get(name)))
+        for name, values in columns.items()
+        for kind in dict.fromkeys(map(type, values))
+        if name not in own
+    ]
+    for name, kind, wanted in tables.unfit_kinds(tuple(kinds)):
+        value = next(each for each in columns[name] if type(each) is kind)
+        raise ValueError(f"its {name} is {str(value)[:60]!r}, wanted a value of type {wanted}")
+    for name, most in tables.MOST.items():
+        for value in columns.get(name, ()):
+            if value is not None and (value < 0 or value > most):
+                raise ValueError(f"its {name} is {value:g}")
+    if wrong := tables.unfit_names(tuple(columns)):
+        raise ValueError(f"it {wrong}")
+
+
 def unpack_result(job: Job, told: object) -> RunResult:
     """Return the result of a run from the answer of a worker, in which code of users may have falsified anything.
 
     Raises:
         ValueError: it is not the result of this run.
     """
-    from servobench.harness.batch import consistency, tables  # noqa: PLC0415 - pandas, which workers do without
+    from servobench.harness.batch import consistency, tables  # noqa: PLC0415 - as above
 
     match told:
         case {
@@ -389,23 +468,7 @@ def unpack_result(job: Job, told: object) -> RunResult:
             pass
         case _:
             raise ValueError("it is not the result of a run")
-    identity, known = episode.identity(job.run), _failed(job, Ending()).row
-    if missing := known.keys() - row.keys():
-        raise ValueError(f"it lacks {min(missing)}")
-    own = (identity.keys() | job.cell.columns.keys()) - {"robot", "engine"}
-    if (
-        len({json.dumps([each[name] for name in own]) for each in (known, row)}) > 1
-    ):  # NaN is NaN, but 1 not 1.0
-        raise ValueError("it is that of another run")
-    for name, wanted in tables.unfit_kinds(
-        tuple((name, type(row[name]), type(known.get(name))) for name in row)
-    ):
-        raise ValueError(f"its {name} is {str(row[name])[:60]!r}, wanted a value of type {wanted}")
-    for name, most in tables.MOST.items():
-        if (value := row.get(name)) is not None and (value < 0 or value > most):
-            raise ValueError(f"its {name} is {value:g}")
-    if wrong := tables.unfit_names(tuple(row)):
-        raise ValueError(f"it {wrong}")
+    _check_columns([job], {name: [value] for name, value in row.items()})
     image = _unpack_array(picture)
     if image is not None and (
         image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size
@@ -442,6 +505,8 @@ def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
 
 
 MAX_DEFAULT_WORKERS: Final = 8
+ABSENCE_TIME: Final = 120.0  # [s] without any worker, after which none is awaited any more
+LOOK_EVERY: Final = 2.0  # [s] between two looks at the workers
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
 # Imported once
 MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks", "numpy.ma")
@@ -582,19 +647,37 @@ def _workers_of(executor: Executor, count: int) -> Workers:
             "an executor must have processes: threads would share the state of solvers and files"
         )
     lost: tuple[type[BaseException], ...] = ()
+    check = Workers.check
     if (dask := sys.modules.get("distributed")) and isinstance(
         executor, dask.cfexecutor.ClientExecutor
     ):
         count, lost = sum(executor._client.nthreads().values()) or count, (dask.KilledWorker,)
+        check = partial(_check_presence, executor._client, [])
     count = getattr(executor, "_max_workers", None) or count
     return Workers(
-        lambda task, _hear=None: executor.submit(_gather, task), count, cluster=True, lost=lost
+        lambda task, _hear=None: executor.submit(_gather, task),
+        count,
+        cluster=True,
+        lost=lost,
+        check=check,
     )
 
 
+def _check_presence(client: Any, seen: list[float]) -> None:  # noqa: ANN401 - of Dask
+    """Refuse to wait for workers that were there and have been away for long; `seen` keeps when they were there."""
+    now = time.monotonic()
+    with contextlib.suppress(OSError, RuntimeError, ValueError):  # futures tell of a lost scheduler
+        if client.nthreads():
+            seen[:] = [now]
+    if seen and now - seen[0] > ABSENCE_TIME:
+        raise BrokenExecutor(f"none has come back for {ABSENCE_TIME:g} s")
+
+
 def _gather(task: Task) -> bytes:
-    """Carry a task out elsewhere; its answers travel as one compressed block. Threads of a process take turns."""
+    """Carry a task out elsewhere; its answers travel as one compressed table. Threads of a process take turns."""
     items = []
     with ONE_TASK:
         task.carry_out(lambda item: None if item is None else items.append(item))
+    if task.answers == len(items) > 1 and (table := pack_together(items)):
+        items = [table]
     return zlib.compress(json.dumps(items).encode(), 1)

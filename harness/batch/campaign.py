@@ -50,6 +50,7 @@ from servobench.harness.run.resolution import (
     check_settings,
     resolve_sections,
     select,
+    share_settings,
 )
 from servobench.harness.run.result import RunResult
 from servobench.harness.run.variations import ROLES
@@ -252,11 +253,16 @@ def _jobs(
     campaign: Campaign, sections: Sections, together: bool, indices: Iterable[int]
 ) -> Iterator[Job]:
     """Yield the jobs of some cells; runs that differ in seed only share their settings, and may advance together."""
+    run: ResolvedRun | None = None
     for index in indices:
         cell = campaign.cells[index]
-        run = select(cell.request, sections)
-        kind = side_by_side_key(run) if together and not cell.picture else None
-        yield Job(index, cell, run, kind, campaign.metrics)
+        if run is not None and share_settings(run.request, cell.request):
+            run = replace(run, request=cell.request)
+        else:
+            run = select(cell.request, sections)
+            kind = side_by_side_key(run)
+        own = kind if together and not cell.picture else None
+        yield Job(index, cell, run, own, campaign.metrics)
 
 
 def _side_by_side(runs: Iterable[ResolvedRun]) -> dict[str, list[str]]:

@@ -116,6 +116,7 @@ class Workers:
     count: int = 1  # number of tasks that are carried out at a time
     cluster: bool = False  # whether runs happen on other machines
     lost: tuple[type[BaseException], ...] = ()  # errors of a future whose process died
+    check: Callable[[], None] = lambda: None  # raises an error once no worker comes back
 
 
 def call(

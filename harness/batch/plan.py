@@ -182,6 +182,7 @@ class Grid(Sequence[Entry_co], Generic[Entry_co]):
         self._make = make
         self._axes = [(axis, len(axis)) for axis in reversed(axes)]
         self._length = math.prod(length for _, length in self._axes)
+        self._slower: tuple[int, list[Any]] = (-1, [])
 
     def __len__(self) -> int:
         """Return the number of combinations."""
@@ -196,11 +197,24 @@ class Grid(Sequence[Entry_co], Generic[Entry_co]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         place = range(self._length)[index]
-        values = []
-        for axis, length in self._axes:
-            place, own = divmod(place, length)
-            values.append(axis[own])
-        return self._make(*reversed(values))
+        if not self._axes:
+            return self._make()
+        fastest, length = self._axes[0]
+        outer, own = divmod(place, length)
+        return self._make(*self._values_at(outer), fastest[own])
+
+    def _values_at(self, outer: int) -> list[Any]:
+        """Return the values of all axes but the fastest; neighbours share them, so that the last ones are kept."""
+        last, values = self._slower
+        if outer != last:
+            place = outer
+            values = []
+            for axis, length in self._axes[1:]:
+                place, own = divmod(place, length)
+                values.append(axis[own])
+            values.reverse()
+            self._slower = (outer, values)
+        return values
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,8 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     files[part_name(index, RUNS)] = partial(tables.write_table, rows, batch=f"{campaign}@{index}")
     with writing(folder):
         for result in outcome:
-            _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result)
+            if result.picture is not None:
+                _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result)
         write_vouched(folder, files)
 
 

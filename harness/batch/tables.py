@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -84,17 +85,16 @@ def sums_of(folder: Path) -> Sums | None:
 def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
     """Return rows as a table with the columns of all; NaN is null, and an empty column of numbers is one of numbers."""
 
-    def column(name: str) -> pa.Array:
-        values = [row.get(name) for row in rows]
+    def column(name: str, values: Sequence[Any]) -> pa.Array:
         made = pa.array(values, from_pandas=True)
         numbers = name in NUMBERS or float in map(type, values)
         if pa.types.is_null(made.type) and numbers:
             return made.cast(pa.float64())
         return made
 
-    return pa.table(
-        {name: column(name) for name in dict.fromkeys(name for row in rows for name in row)}
-    )
+    empty: dict[str, Any] = dict.fromkeys(chain.from_iterable(rows))
+    columns = zip(*((empty | dict(row)).values() for row in rows), strict=True)
+    return pa.table(dict(zip(empty, map(column, empty, columns), strict=True)))
 
 
 def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
@@ -297,18 +297,18 @@ def lacking(kind: str, schema: pa.Schema) -> str:
 
 
 @lru_cache(8)  # the rows of a batch have the same ones
-def unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, str]]:
-    """Return the columns with a value of a wrong type, each with the name of the right one.
+def unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, type, str]]:
+    """Return the columns with a value of a wrong type, each with this type and the name of the right one.
 
     Args:
-        kinds: name, type of the value and type of the known value of each column.
+        kinds: name, type of a value and type of the known value of each column.
     """
     unfit = []
     for name, kind, known in kinds:
         usual = str if name in TEXTS else float
         wanted = (usual, type(None)) if known is type(None) else (known,)
         if not issubclass(kind, wanted):
-            unfit.append((name, wanted[0].__name__))
+            unfit.append((name, kind, wanted[0].__name__))
     return unfit
 
 

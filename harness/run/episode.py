@@ -190,6 +190,13 @@ def _row(
 
 
 def identity(run: ResolvedRun) -> dict[str, Any]:
-    """Return the columns that are known of a run before it is carried out, with an unusual period."""
-    period = {} if run.run.period == RunSettings.period else {"period_s": run.run.period}
-    return {**run.request.as_row(), **period, "engine": engine_of(run.request.plant)}
+    """Return the columns that are known of a run before it is carried out."""
+    return {**wanted_columns(run), "engine": engine_of(run.request.plant)}
+
+
+def wanted_columns(run: ResolvedRun) -> dict[str, Any]:
+    """Return the columns by which a run is found, with an unusual period."""
+    row = run.request.as_row()
+    if run.run.period != RunSettings.period:
+        row["period_s"] = run.run.period
+    return row

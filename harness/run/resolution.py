@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from operator import attrgetter
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,10 +16,14 @@ from servobench.harness.run.variations import ROLES, Varied
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import listed, override, remark, suggest
-from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
+from servobench.plant.robot.catalogue import DEFAULT_ROBOT, ROBOTS, find_robot
 from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.twin import Twin
+
+_BUT_SEED: Final = attrgetter(
+    "plant", "controller", "task", "mismatch", "varied", "robot", "sensing"
+)
 
 
 class Sections(dict[str, Any]):
@@ -232,6 +237,11 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
         sections.with_changes(request.controller, request.varied_in("controller")),
         sections.with_changes(request.task, request.varied_in("task")),
     )
+
+
+def share_settings(one: RunRequest, other: RunRequest) -> bool:
+    """Return whether two runs surely have the same settings: they differ in the seed, by which a twin draws times."""
+    return one.robot in ROBOTS and _BUT_SEED(one) == _BUT_SEED(other)
 
 
 def _drawn_times(twin: Twin, usual: Mapping[str, Any], seed: int) -> Varied:

@@ -541,6 +541,119 @@ def test_steps_that_do_not_fit_their_row_are_refused(real, column, factor, why):
         sent(real, steps=real.steps.assign(**{column: factor * real.steps[column]}))
 
 
+def table_of(*rows: dict[str, object]) -> dict[str, object]:
+    """The table of columns in which answers travel from a worker of an executor."""
+    return blocks.pack_together([told(row=row) for row in rows])
+
+
+def rows_of(*changes: dict[str, object]) -> list[dict[str, object]]:
+    return [
+        RunResult.failed(identity(job(index, None).run), Ending("collision")).row | changed
+        for index, changed in enumerate(changes)
+    ]
+
+
+def test_rows_are_the_same_after_their_way_as_columns(real):
+    rows = [real.row, real.row | {"run_id": job(1, None).run.request.run_id, "seed": 1}]
+    sent_table = json.loads(json.dumps(table_of(*rows)))
+    back = list(blocks._unpacked([job(0, None), job(1, None)], [sent_table]))
+    pd.testing.assert_frame_equal(
+        pd.DataFrame([each.row for each in back]), pd.DataFrame(rows), check_exact=True
+    )
+    assert [list(each.row) for each in back] == [list(real.row)] * 2
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"run_id": "../../escaped"}, "it is that of another run"),
+        ({"seed": 1.0}, "it is that of another run"),
+        ({"controller": "rls"}, "it is that of another run"),
+        ({"status": 3}, "its status is '3', wanted a value of type str"),
+        ({"rms_error": "small"}, "its rms_error is 'small', wanted a value of type float"),
+        ({"controller_time_p99_us": -math.inf}, "its controller_time_p99_us is -inf"),
+        ({"saturation_fraction": 1.5}, "its saturation_fraction is 1.5"),
+        ({"outcome": "settled"}, "its outcome 'settled' contradicts its status"),
+    ],
+)
+def test_one_falsified_row_among_columns_is_refused(change, why):
+    rows = rows_of({name: None for name in change if "_" in name and name != "run_id"}, change)
+    with pytest.raises(ValueError, match=why):
+        list(blocks._unpacked([job(0, None), job(1, None)], [table_of(*rows)]))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda table: table["columns"].pop("status"),
+        lambda table: table["columns"]["status"].pop(),
+        lambda table: table["columns"].update(status="collision"),
+        lambda table: table["columns"].update({"two\nlines": [1.0, 1.0]}),
+        lambda table: table["traces"].append(""),
+        lambda table: table.update(traces=[1, 2]),
+        lambda table: table.update(columns=[]),
+    ],
+)
+def test_a_table_that_is_not_one_of_its_runs_is_refused(spoil):
+    table = table_of(*rows_of({}, {}))
+    spoil(table)
+    with pytest.raises((TypeError, ValueError)):
+        list(blocks._unpacked([job(0, None), job(1, None)], [table]))
+
+
+@pytest.mark.parametrize(
+    ("forge", "again"), [("row", [1, 1]), ("length", [1]), ("kind", [1, 1, 1])]
+)
+def test_runs_of_a_falsified_table_are_carried_out_again_one_by_one(forge, again):
+    sizes: list[int] = []
+
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
+        sizes.append(len(block.jobs))
+        items = [
+            blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision")))
+            for each in block.jobs
+        ]
+        answer = blocks.pack_together(items)
+        if len(sizes) == 1:
+            if forge == "row":
+                answer["columns"]["outcome"][1] = "settled"
+            elif forge == "length":
+                answer["columns"]["outcome"].pop()
+            else:
+                answer["columns"]["rms_error"] = 5
+        future = Future()
+        future.set_result(zlib.compress(json.dumps([answer]).encode()))
+        return future
+
+    block = Block(tuple(job(index, "alike") for index in range(3)), together=True)
+    found = [result for _, part in carry_out_blocks([block], Workers(submit)) for result in part]
+    assert sizes == [3, *again]
+    assert sorted(each.row["seed"] for each in found) == [0, 1, 2]
+    assert {each.row["outcome"] for each in found} == {"collision"}
+
+
+def test_a_batch_ends_with_a_line_if_the_workers_of_a_cluster_never_come_back(monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    monkeypatch.setattr(blocks, "LOOK_EVERY", 0.1)
+    monkeypatch.setattr(blocks, "ABSENCE_TIME", 0.5)
+    cluster = distributed.LocalCluster(1, processes=False, dashboard_address=":0")
+    line = "^the workers ended: none has come back for 0.5 s; finished runs are kept"
+    with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
+
+        def submit(task):
+            cluster.scale(0)
+            return Future()
+
+        def sweep():
+            with open_workers(1, executor) as workers:
+                workers.check()
+                list(carry_out_blocks([Block((job(0, None),))], replace(workers, submit=submit)))
+
+        with pytest.raises(ConfigurationError, match=line):
+            sweep()
+
+
 @pytest.mark.parametrize("count", [0, 1])
 @pytest.mark.parametrize("unreadable", [False, True])
 def test_a_task_that_is_done_with_fewer_answers_than_runs_has_a_row_for_each_run(count, unreadable):
