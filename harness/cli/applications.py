@@ -41,13 +41,14 @@ APPLICATIONS: Final = {
         "claims, challenges and the robustness map", ("robustness", "suite", "claims")
     ),
     "figures": Application("pictures of a results folder, drawn from its tables", ("figures",)),
+    "exports": Application("steps of runs for other tools", ("export",)),
     "films": Application("films and snapshots of runs", ("record",), "animation"),
     "report": Application("a page about a results folder", ("report",), "report"),
     "loops": Application("loops at rest: margins and limits", ("analyse",)),
 }
 CORE: Final = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),
-    "results": ("statistics", "collect", "export", "verify"),
+    "results": ("statistics", "collect", "verify"),
     "lists": ("plants", "controllers", "tasks", "sensing", "init"),
 }
 PANELS: Final = {  # title on the help page -> commands, in the order of first use

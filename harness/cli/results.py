@@ -1,4 +1,4 @@
-"""The commands on results folders: `statistics | collect | export | verify`; the verdict on failed runs."""
+"""The commands on results folders: `statistics | collect | verify`; the verdict on failed runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from servobench.harness.cli.options import (
     JsonOption,
     NamesOption,
     ShownOption,
-    named_option,
     option,
     switch,
 )
@@ -158,37 +157,6 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     if found.findings:
         sys.exit(FAILED)
     say(f"{found.files} files are as they were written, {found.runs} runs")
-
-
-def export(
-    folder: Annotated[
-        Path, typer.Argument(help="Results folder of run or compare, which keep steps.")
-    ],
-    out: Annotated[Path, option("FOLDER", "New folder for the files.")],
-    format_: Annotated[
-        str,
-        named_option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap)."),
-    ] = "csv",
-    run: Annotated[
-        str | None, named_option("--run", "RUN_ID", "One run alone; default: all.")
-    ] = None,
-    controllers: ShownOption = "all",
-) -> None:
-    """Write the steps of runs for other tools, a file a run."""
-    from servobench.harness.analysis.exports import export_folder
-    from servobench.harness.batch.logs import find_run
-    from servobench.harness.batch.results import ResultsFolder
-
-    opened = ResultsFolder(folder)
-    runs = opened.runs()
-    if run is not None:
-        chosen = find_run(opened, run)["run_id"]
-        runs = runs[runs["run_id"] == chosen]
-    known = list(dict.fromkeys(runs["controller"]))
-    runs = runs[runs["controller"].isin(selection.split_names("controllers", controllers, known))]
-    say(opened.describe_missing())
-    files = export_folder(opened, out, format_, runs)
-    say(f"{len(files)} files in {out}")
 
 
 def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:

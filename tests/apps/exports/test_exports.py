@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from mcap.reader import make_reader
 
-from servobench.harness.analysis.exports import export_folder
+from servobench.harness.apps.exports.exports import export_folder
 from servobench.harness.batch.api import compare, load
 from servobench.harness.batch.results import ResultsFolder
 from servobench.plant.contract.faults import ConfigurationError

@@ -1,0 +1,1 @@
+"""Steps of runs for other tools."""
