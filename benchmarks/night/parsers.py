@@ -27,10 +27,10 @@ from kit.toy import TRAINING, plant_spec
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
 from servobench.fmus.compiler import parse_platforms
-from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.analysis.folder import describe_folder, describe_settings
 from servobench.harness.analysis.tables import judge_places
+from servobench.harness.apps.fmu.inspection import read_information
 from servobench.harness.apps.tuning.objective import Ledger
 from servobench.harness.batch import results, store
 from servobench.harness.batch.integrity import examine

@@ -107,7 +107,7 @@ def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(
     path = tmp_path / "crane.fmu"
     build_crane(path, 2)
     # The crane has no ModelStructure
-    monkeypatch.setattr("servobench.fmus.inspection.validate_by_fmpy", lambda _: [])
+    monkeypatch.setattr("servobench.harness.apps.fmu.inspection.validate_by_fmpy", lambda _: [])
     assert "no reference run inside; it was loaded and made ready for a run\n" in output_of(
         "fmu", "validate", path
     )

@@ -34,10 +34,10 @@ from servobench.fmus.export import (
     fingerprint,
     nominal_setup,
 )
-from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
+from servobench.harness.apps.fmu.inspection import read_information, validate_fmu
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import PIXEL, pixels
 from servobench.plant.fmu.archive import extract_fmu

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from servobench.fmus.export import ExportOptions, export_fmu, nominal_setup
-from servobench.fmus.inspection import validate_fmu
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
+from servobench.harness.apps.fmu.inspection import validate_fmu
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.lanes import stack

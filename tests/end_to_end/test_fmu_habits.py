@@ -11,7 +11,7 @@ from kit.command import servobench
 from kit.stub_fmu import PROBES, TARGET, build_stub, describe
 from servobench import Controller, compare
 from servobench.fmus.export import ExportOptions, export_fmu, nominal_setup
-from servobench.fmus.inspection import validate_fmu
+from servobench.harness.apps.fmu.inspection import validate_fmu
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import Block, Job, _carry_out_there, unpack_result
 from servobench.harness.batch.plan import Batch, Cell

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kit.foreign_fmu import ROLES, build_crane, describe_with
-from servobench.fmus.inspection import read_information, shape_of
+from servobench.harness.apps.fmu.inspection import read_information, shape_of
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 

@@ -7,7 +7,7 @@ from kit.command import servobench
 from kit.own import write
 from kit.plants import NEEDS_BULLET
 from kit.robots import FOUR_JOINTS, calibration_text
-from servobench.fmus.inspection import read_information, validate_fmu
+from servobench.harness.apps.fmu.inspection import read_information, validate_fmu
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build

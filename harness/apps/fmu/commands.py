@@ -181,7 +181,7 @@ def validate(file: FileArgument) -> None:
 @fmu.command()
 def info(file: FileArgument) -> None:
     """Show version, license, platforms, capabilities and variables."""
-    from servobench.fmus.inspection import read_information, shape_of
+    from servobench.harness.apps.fmu.inspection import read_information, shape_of
 
     with configuration_errors():
         information = read_information(file)

@@ -10,7 +10,7 @@ from servobench.harness.batch.trials import attempt
 from servobench.plant.contract.faults import FmuError, configuration_errors
 
 if TYPE_CHECKING:
-    from servobench.fmus.inspection import Validation
+    from servobench.harness.apps.fmu.inspection import Validation
 
 
 def validate(path: Path) -> Validation:
@@ -19,7 +19,7 @@ def validate(path: Path) -> Validation:
     Raises:
         ConfigurationError: it is not a co-simulation FMU of FMI 2 or 3.
     """
-    from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
+    from servobench.harness.apps.fmu.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
     from servobench.harness.batch.processes import FOREIGN_TIME  # noqa: PLC0415 - as above
 
     answer, failure = attempt(
@@ -32,7 +32,7 @@ def validate(path: Path) -> Validation:
 
 
 def _validate(path: Path) -> tuple[Sequence[str], Sequence[str], float | None]:
-    from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
+    from servobench.harness.apps.fmu.inspection import validate_fmu  # noqa: PLC0415 - as above
 
     with configuration_errors("", FmuError):
         found = validate_fmu(path)

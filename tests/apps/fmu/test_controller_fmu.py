@@ -13,8 +13,8 @@ from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, period
 from kit.fmpy_instance import Driven
 from kit.nightly import some
 from servobench.fmus.controllers.branches import leaves_of
-from servobench.fmus.inspection import validate_fmu
 from servobench.harness.apps.fmu import products as controller_fmu
+from servobench.harness.apps.fmu.inspection import validate_fmu
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
