@@ -6,6 +6,7 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.controllers.aids import describe_aids
+from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS, MAPPED
@@ -103,7 +104,9 @@ def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> lis
         if name in changed:
             line += ", and then given other settings"
         lines.append(line)
-    known = {name for name in names if name in CONTROLLERS and tuned_settings(name)} | tuned.keys()
+    known = tuned.keys() | METHODS.keys()
+    known |= {name for name in names if name in CONTROLLERS and tuned_settings(name)}
+    known &= set(names)
     untuned = []
     places = []
     for name in names:
