@@ -403,7 +403,7 @@ class _Problem:
         self.y = log.features[self.rows]
         self.motion = CubicSpline(log.time, log.joints)
         self.middle = float(log.time.mean())
-        pixels = _sees_pixels(model)
+        pixels = sees_pixels(model)
         self.names = _parameters(model, pixels=pixels)
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
@@ -610,7 +610,8 @@ def fitted_wave(
     return pace, np.array(best), left / max(float(np.sum(target**2)), 1e-18)
 
 
-def _sees_pixels(model: RobotModel) -> bool:
+def sees_pixels(model: RobotModel) -> bool:
+    """Return whether the features of a model are pixels."""
     return isinstance(model, SetupModel) and model.setup.name == PIXEL.name
 
 
@@ -669,7 +670,7 @@ def fit_cameras(
     """
     features = np.broadcast_to(features, (*joints.shape[:2], features.shape[-1]))
     logs_at_once = max(1, ROWS_AT_ONCE // joints.shape[1])
-    fit: Any = _by_pixels if _sees_pixels(model) else _by_places
+    fit: Any = _by_pixels if sees_pixels(model) else _by_places
     poses = []
     errors = []
     for first in range(0, len(joints), logs_at_once):

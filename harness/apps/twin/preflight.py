@@ -23,6 +23,7 @@ from servobench.harness.apps.twin.identification import (
 )
 from servobench.harness.apps.twin.search import searched
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.hand_eye import RobotModel
 
 # Features in m that move farther than the nominal robot's by this factor are in another unit.
@@ -39,6 +40,8 @@ REMEDY_GAIN: Final = 0.8  # [1]
 PAIR_GAIN: Final = 0.5  # [1]
 # A log cannot tell mistakes apart whose remedies leave at most this many times the least misfit.
 TIE_RATIO: Final = 1.1  # [1]
+# The robot of a search is taken if it leaves less than this share of the squared residuals.
+SEARCH_GAIN: Final = 0.8  # [1]
 SCREENED: Final = 6  # number of remedies that are fitted, those with the least errors
 REMEDIES_AT_ONCE: Final = 64  # remedies for which cameras are placed side by side
 FRAMES: Final = 150  # frames for fits of remedies
@@ -77,8 +80,9 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         found = _moved(log, model)
         if found:
             return found, None
-        other = identify(log, model, begin=searched(log, model))
-        if _is_noise(log, other):
+    if _above_noise(log, robot).any():
+        other = _far_robot(log, model)
+        if _is_noise(log, other) and _explains_more(other, robot):
             robot = other
     found = _clocks(log, robot)
     if not is_explained(log, robot):
@@ -88,6 +92,17 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         if not found:
             found = _large_errors_named(log, robot, model, others)
     return found, None if found else robot
+
+
+def _far_robot(log: Log, model: RobotModel) -> Identified:
+    """Return the robot of the arm that explains a log best, however far it is from the nominal one."""
+    as_it_is = _Remedy("", log, model)
+    noise = _noise_for_misfits(log)
+
+    def misfit(begin: Mapping[str, float]) -> float:
+        return _misfit(_fit(as_it_is, begin), noise)
+
+    return identify(log, model, begin=min(searched(log, model), key=misfit))
 
 
 def _large_errors_named(log: Log, robot: Identified, model: RobotModel, others: Others) -> str:
@@ -122,12 +137,23 @@ def is_explained(log: Log, robot: Identified) -> bool:
     return _is_noise(log, robot) and not robot.unlikely()
 
 
+def _above_noise(log: Log, robot: Identified) -> BoolArray:
+    """Return which features have residuals far above the noise, (m,)."""
+    spread = np.sqrt(np.diag(robot.noise))
+    return np.asarray(spread > MAX_NOISE_RATIO * noise_of(log))
+
+
 def _is_noise(log: Log, robot: Identified) -> bool:
     """Return whether residuals are not far above the noise, or small beside the motion, for most of the frames."""
-    spread = np.sqrt(np.diag(robot.noise))
-    above_noise = spread > MAX_NOISE_RATIO * noise_of(log)
-    rest = above_noise & (_shares(log, robot) > MIN_SHARE)
+    rest = _above_noise(log, robot) & (_shares(log, robot) > MIN_SHARE)
     return bool(not rest.any() and robot.inliers.mean() > 0.5)
+
+
+def _explains_more(one: Identified, other: Identified) -> bool:
+    """Return whether one robot leaves clearly less than another, or is the first that most frames belong to."""
+    if other.inliers.mean() <= 0.5:
+        return True
+    return bool(np.trace(one.noise) < SEARCH_GAIN * np.trace(other.noise))
 
 
 def _shares(log: Log, robot: Identified) -> FloatArray:
@@ -250,7 +276,7 @@ def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
     """
     rows = frames_of(log, FRAMES)
-    noise = np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
+    noise = _noise_for_misfits(log)
     explained = MAX_NOISE_RATIO**2 * log.spec.m * len(rows)
     as_it_is = _misfit(_fit(_Remedy("", log, model), known), noise)
     stages = [(_remedies, REMEDY_GAIN), (_pairs, PAIR_GAIN)]
@@ -281,6 +307,12 @@ def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[
 def _fit(remedy: _Remedy, begin: Mapping[str, float] | None = None) -> Identified:
     """Return the robot behind a remedy, by a few frames."""
     return identify(remedy.log, remedy.model, FRAMES, fits=2, begin=begin)
+
+
+def _noise_for_misfits(log: Log) -> FloatArray:
+    """Return the deviation of a feature's noise, (m,), or a small share of the motion where that is more."""
+    rows = frames_of(log, FRAMES)
+    return np.asarray(np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max()))
 
 
 def _misfit(robot: Identified, noise: FloatArray) -> float:

@@ -17,21 +17,29 @@ from servobench.controllers.stages.arm_fit import (
     Members,
     squared,
 )
-from servobench.harness.apps.twin.identification import Log, frames_of, played
+from servobench.harness.apps.twin.identification import (
+    Log,
+    fit_cameras,
+    frames_of,
+    played,
+    sees_pixels,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.parametric import ParametricModel
+from servobench.plant.robot.twin import deviated
 
-DRAWN: Final = 1024  # arms that are drawn
+DRAWN: Final = 2048  # arms that are drawn
 SCREENED_AT_ONCE: Final = 256
-KEPT: Final = 8  # the best of those, of which each is fitted
+KEPT: Final = 16  # the best of those, of which each is fitted
 COARSE: Final = 1e-2  # [m] deviation of residuals in that comparison, in natural units
 ITERATIONS: Final = 40
+RETURNED: Final = 4  # arms, as several leave nearly the same after so many
 MEDIAN: Final = 2.366  # median of the squared length of three normal variables
 
 
-def searched(log: Log, model: RobotModel) -> dict[str, float]:
-    """Return the parameters by name, those of the camera left out, of the arm that explains a log best.
+def searched(log: Log, model: RobotModel) -> list[dict[str, float]]:
+    """Return the parameters by name, those of the camera left out, of the arms that explain a log best.
 
     Args:
         log: rows of a robot with one fixed camera.
@@ -40,28 +48,47 @@ def searched(log: Log, model: RobotModel) -> dict[str, float]:
     fit = Fit(ParametricModel(model), log.spec.feature.scale, log.spec.period)
     frames = _frames(fit, log)
     never_late = np.zeros(())
-    trial = fit.begun(_members(fit, frames), frames, np.array([FLOOR**2]))
+    trial = fit.begun(_members(fit, model, frames), frames, np.array([FLOOR**2]))
     middle = trial.variance
     for _ in range(ITERATIONS):
         # What the best member leaves is taken for noise.
         floor = np.maximum(middle.min() / MEDIAN, FLOOR**2)
         trial = fit.annealed(trial, frames, never_late, floor[None])
         middle = np.median(squared(fit.residual(trial.members, frames)), axis=-1)
-    theta = trial.members.theta[middle.argmin()]
+    best = np.argsort(middle)[:RETURNED]
+    return [_values(fit, theta) for theta in trial.members.theta[best]]
+
+
+def _values(fit: Fit, theta: FloatArray) -> dict[str, float]:
+    """Return the parameters of an arm by name, those of the camera left out."""
     values = dict(zip(fit.names, theta.tolist(), strict=True))
     values["backlash"] = values.pop("play")
     return {name: value for name, value in values.items() if not name.startswith("camera")}
 
 
-def _members(fit: Fit, frames: Frames) -> Members:
+def _members(fit: Fit, model: RobotModel, frames: Frames) -> Members:
     """Return the nominal arm, and the best of many drawn ones before any iteration."""
     latency = np.array(LATENCY[0])
     coarse = np.full(SCREENED_AT_ONCE, COARSE**2)
-    parts = [fit.start((), 1, latency)]
+    parts = [_placed(fit, model, fit.start((), 1, latency), frames)]
     for first in range(0, DRAWN, SCREENED_AT_ONCE):
         drawn = fit.spawned((), np.array(first), SCREENED_AT_ONCE, latency)
-        parts.append(fit.screened(drawn, frames, coarse, KEPT))
+        placed = _placed(fit, model, drawn, frames)
+        parts.append(fit.screened(placed, frames, coarse, KEPT))
     return Members(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _placed(fit: Fit, model: RobotModel, members: Members, frames: Frames) -> Members:
+    """Return members whose cameras see the pixels of the frames from where they fit best; the fit places others."""
+    if not sees_pixels(model):
+        return members
+    gears, _ = fit.exposed(members, frames.path)
+    pixels = fit.scale * frames.feature
+    cameras = members.cameras.copy()
+    for member, (theta, joints) in enumerate(zip(members.theta, gears.joints, strict=True)):
+        arm = deviated(model, _values(fit, theta))
+        cameras[member], _ = fit_cameras(arm, joints[None], pixels)
+    return members._replace(cameras=cameras)
 
 
 def _frames(fit: Fit, log: Log) -> Frames:

@@ -693,15 +693,23 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
 
 
 @pytest.mark.slow
-def test_an_arm_far_from_the_nominal_one_is_found_by_the_search():
+@pytest.mark.parametrize(("sensing", "seed"), [("position", 88702), ("pixel", 88709)])
+def test_an_arm_far_from_the_nominal_one_is_found_by_the_search(sensing, seed):
     settings = {"random": {"duration": 60.0}, "Excite": {"swing": 0.25}}
     words = find_challenge("unknown_arm").mismatch
     made = run(
-        "docs/examples/excite.py", task="random", mismatch=words, seed=88702, settings=settings
+        "docs/examples/excite.py",
+        task="random",
+        mismatch=words,
+        seed=seed,
+        sensing=sensing,
+        settings=settings,
     )
-    request = RunRequest("kinematic", "constant", "random", Mismatch.parse(words), 88702)
-    model = find_robot("ur5").nominal
-    log = read_log(logged()[0].spec, made.steps)
+    request = RunRequest(
+        "kinematic", "constant", "random", Mismatch.parse(words), seed, sensing=sensing
+    )
+    model = find_sensing(sensing).nominal(find_robot("ur5"))
+    log = read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * math.pi), made.steps)
 
     def error(robot):
         true = draw_robot(request)[0]
