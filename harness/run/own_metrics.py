@@ -8,14 +8,14 @@ The function gets the table of steps of one run, with at least one row, and retu
 apply. It is called in the process of the run.
 """
 
+from __future__ import annotations
+
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from numbers import Real
-from typing import Any, Final, Literal, NoReturn, TypeAlias
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn, TypeAlias
 
 from servobench.harness.config.entries import Kind
 from servobench.harness.config.registry import DECLARED, Registry
@@ -23,6 +23,9 @@ from servobench.harness.run.metrics import BUILT_IN, Metric, Summary
 from servobench.harness.run.result import Ending, WrongAnswer, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import NonNegative, settings
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 GROUP: Final = "Own"  # columns in tables of the report, and kind of figure
 TABLES: Final = ("moves", "curves", "runs")  # tables of the report

@@ -51,6 +51,7 @@ OWN = (
     "planar",
     "nominal_rate",
     "learned",
+    "look_then_move",
 )
 
 

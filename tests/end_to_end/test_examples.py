@@ -23,6 +23,7 @@ EXAMPLES = {
 }
 
 
+LOOKING = {"look_then_move"}  # tested below
 LEARNING = {"train_policy", "learned_policy"}  # tested below
 ROBOTS = {"on_a_ur"}  # tests/end_to_end/test_on_a_ur.py
 MOTIONS = {"excite"}  # tests/harness/test_identification.py moves an arm by it
@@ -36,6 +37,7 @@ LAWS = {
 def test_every_example_is_listed_here():
     assert {path.stem for path in FOLDER.glob("*.py")} == {
         *EXAMPLES,
+        *LOOKING,
         *LEARNING,
         *LAWS,
         *MOTIONS,
@@ -49,6 +51,23 @@ def test_an_example_runs_and_prints(name, tmp_path, monkeypatch, capsys):
     runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     printed = capsys.readouterr().out
     assert re.search(EXAMPLES[name], printed), printed
+
+
+def test_a_robot_that_looks_and_then_moves_errs_by_its_calibration():
+    look = f"{FOLDER / 'look_then_move.py'}:LookThenMove"
+
+    def error(mismatch):
+        made = servobench.run(look, task="random", mismatch=mismatch, seed=88700)
+        assert made.row["status"] == "completed"
+        return made.row["steady_state_error"]
+
+    assert servobench.check_controller(look).ok
+    assert error("none") < 1e-9
+    # About an axis through the middle of the workspace, from which targets are up to 0.3 m away
+    assert 0.003 < error("camera_rotation=3deg") < 0.3 * np.radians(3.0)
+    assert error("camera_rotation=3deg") == pytest.approx(
+        3.0 * error("camera_rotation=1deg"), rel=0.02
+    )
 
 
 @pytest.mark.parametrize("law", LAWS)

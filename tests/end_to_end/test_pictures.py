@@ -359,7 +359,7 @@ def paper(monkeypatch, folder, *arguments):
 
 def test_every_figure_of_the_report_fits_a_column_of_a_paper(monkeypatch, tmp_path):
     folder = comparison(tmp_path / "out", ("ukf_mfac", "mine"), ("exp1", "circle"))
-    wanted = {name for name, kind in KINDS.items() if kind.in_page} - {"conditions"}
+    wanted = {name for name, kind in KINDS.items() if kind.in_page} - {"conditions", "own"}
     words = ("--no-title", "--names", "Proposed,$K_p$ alone", "--kind", ",".join(wanted))
     code, files = paper(monkeypatch, folder, *words)
     assert code == 0

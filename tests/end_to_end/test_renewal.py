@@ -25,6 +25,7 @@ from page_studies.study import ENGINES, Study, nothing, sweep
 from servobench.harness.apps.studies import robustness
 from servobench.harness.batch import results
 from servobench.harness.batch.plan import TUNING, Batch, SweepPlan, parse_seeds
+from servobench.harness.batch.trials import choose
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.resolution import resolve_sections, select
 
@@ -202,6 +203,7 @@ def test_methods_tasks_and_settings_of_the_sweeps_are_known_and_fit_each_other(s
         lists = [
             tuple(option(words, f"--{name}", value).split(",")) for name, value in usual.items()
         ]
+        lists[1] = tuple(choose("controller", name) for name in lists[1])
         seeds = parse_seeds(option(words, "--seeds"))[:1]
         batch = Batch(
             *lists,

@@ -91,7 +91,7 @@ def test_signals_that_were_ignored_on_entry_stay_ignored_but_ctrl_c():
 # The command `servobench`, to which a signal comes as soon as it has written a few files.
 SIGNALLED = """
 import signal, sys
-from servobench.harness.analysis import exports
+from servobench.harness.apps.exports import exports
 from servobench.harness.cli.main import main
 name = sys.argv.pop(1)
 write, written = exports.write_csv, []
