@@ -26,6 +26,8 @@ class LookThenMove(servobench.Controller):
     """q* with h(q*) = y_ref for the features h of the nominal robot; then u = gain (q* − q), within the limits."""
 
     def __init__(self, config: LookThenMoveConfig, knowledge):
+        if knowledge.nominal_model is None:
+            raise ValueError("looking, then moving needs the geometry of the robot")
         self.config = config
         self.model = knowledge.nominal_model
         self.limit = knowledge.spec.joint_velocity_limit
