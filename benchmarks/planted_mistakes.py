@@ -127,7 +127,7 @@ MISTAKES: Final[dict[str, tuple[Change, str]]] = {
     "axis mirrored": (features(lambda y: y * (1.0, -1.0, 1.0)), "axis of the camera is mirrored"),
     "clocks drift": (drifting, "clocks of camera and joints drift"),
     "frames repeat": (repeated, "frames repeat another one"),
-    "rows missing": (with_gap, "rows must be the control period"),
+    "rows missing": (with_gap, "rows are lost"),
     "another arm": (
         lambda log: log._replace(robot=TWINS[log.robot]) if log.robot in TWINS else log,
         "the arm is a",

@@ -70,6 +70,7 @@ LATENCY: Final = (0.1, 0.3)  # [s] L₀ and σ_L
 LATENCIES: Final = (-0.02, LONGEST - 0.05)
 TURNING: Final = 0.05  # [rad/s] σ_ω
 STUDENT: Final = 8.0  # c [1]
+MEDIAN_SQUARE: Final = 2.366  # median of the squared length of three normal variables
 PLACE: Final = 1.0  # [m] prior deviation of the camera's place
 FLOOR: Final = 0.3e-3  # [m] least σ, in natural units
 FIRST_DAMPING: Final = 1e-2  # [1] λ

@@ -27,6 +27,7 @@ from servobench.controllers.stages.arm_fit import (
     FRAMES,
     GEARS,
     KEPT,
+    MEDIAN_SQUARE,
     Fit,
     Fitted,
     Frames,
@@ -388,7 +389,7 @@ class Calibration:
         there = np.maximum.reduce(frames.weight, axis=-1) > 0.0
         square = squared(residual)
         own = pick(square, best)
-        rms = np.sqrt(_median_of(own, there) / 2.366)
+        rms = np.sqrt(_median_of(own, there) / MEDIAN_SQUARE)
         bias = self._bias(
             residual, square, frames, elapsed, np.minimum(noise, 1.5 * rms + 0.2e-3), noise
         )

@@ -145,9 +145,12 @@ def methods_paragraph(
         names: the controllers that are shown, with their names in tables.
     """
     shown = runs[runs["controller"].isin(list(names))]
-    titles = [
-        f"{label} ({name})".replace(f"{name} ({name})", name) for name, label in names.items()
-    ]
+    titles = []
+    for name, label in names.items():
+        if label == name:
+            titles.append(name)
+        else:
+            titles.append(f"{label} ({name})")
     facts = describe_folder(manifest, shown) | {"controller": ", ".join(titles)}
     packages = manifest.get("packages") or {}
     version = str(packages.get("servobench") or "unknown").translate(SIGNS)

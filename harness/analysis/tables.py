@@ -258,12 +258,11 @@ def _pairs(
 ) -> list[tuple[str, str]]:
     """Return pairs of some controllers of a place, those that share a seed: a batch may be unfinished."""
     seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller")}
-    known = [name for name in names if name in seeds]
-    known.sort(key=lambda name: name != against)  # so that it is the first one of its pairs
-    pairs = combinations(known, 2)
-    return [
-        pair for pair in pairs if against in (None, pair[0]) and seeds[pair[0]] & seeds[pair[1]]
-    ]
+    present = [name for name in names if name in seeds]
+    pairs = list(combinations(present, 2))
+    if against is not None:
+        pairs = [(against, name) for name in present if name != against]
+    return [(first, second) for first, second in pairs if seeds.get(first, set()) & seeds[second]]
 
 
 def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str, str]:

@@ -260,9 +260,8 @@ def _jobs(
             run = replace(run, request=cell.request)
         else:
             run = select(cell.request, sections)
-            kind = side_by_side_key(run)
-        own = kind if together and not cell.picture else None
-        yield Job(index, cell, run, own, campaign.metrics)
+            key = side_by_side_key(run) if together else None
+        yield Job(index, cell, run, None if cell.picture else key, campaign.metrics)
 
 
 def _side_by_side(runs: Iterable[ResolvedRun]) -> dict[str, list[str]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn, TypeAlias
 
@@ -147,18 +147,17 @@ def declare_metrics(records: Mapping[str, Mapping[str, Any]]) -> None:
     """
     if taken := BUILT_IN.keys() & records.keys():
         raise ConfigurationError(f"own metric {min(taken)}: servobench has one of this name")
+    entries = [field.name for field in fields(Declaration)]
     for name, record in records.items():
-        known: dict[str, Any] = {
-            key: record.get(key) for key in ("unit", "better", "margin", "digits")
-        }
+        values: dict[str, Any] = {entry: record.get(entry) for entry in entries}
         with configuration_errors(f"own metric {name}: "):
-            declared = Declaration(**known)
+            declared = Declaration(**values)
         DECLARED[name] = Metric(
-            name,
-            declared.unit,
-            name,
-            declared.digits,
-            str(record.get("summary")),
+            column=name,
+            unit=declared.unit,
+            label=name,
+            digits=declared.digits,
+            meaning=str(record.get("summary")),
             better=declared.better,
             margin=declared.margin,
             tables=dict.fromkeys(TABLES, GROUP),

@@ -9,9 +9,11 @@ from scipy.interpolate import CubicSpline
 
 from servobench.controllers.stages.arm_fit import (
     ASSUMED_PLAY,
+    DRAWS,
     FLOOR,
     FRAMES,
     LATENCY,
+    MEDIAN_SQUARE,
     Fit,
     Frames,
     Members,
@@ -29,13 +31,11 @@ from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.parametric import ParametricModel
 from servobench.plant.robot.twin import deviated
 
-DRAWN: Final = 2048  # arms that are drawn
-SCREENED_AT_ONCE: Final = 256
-KEPT: Final = 16  # the best of those, of which each is fitted
-COARSE: Final = 1e-2  # [m] deviation of residuals in that comparison, in natural units
-ITERATIONS: Final = 40
-RETURNED: Final = 4  # arms, as several leave nearly the same after so many
-MEDIAN: Final = 2.366  # median of the squared length of three normal variables
+SCREENED_AT_ONCE: Final = 256  # arms that are compared before any iteration
+KEPT: Final = 16  # the best of them, which are fitted
+COARSE: Final = 1e-2  # [m] deviation of residuals in this comparison, in natural units
+ITERATIONS: Final = 40  # which each fit makes
+RETURNED: Final = 4  # arms, as several may leave nearly equal residuals
 
 
 def searched(log: Log, model: RobotModel) -> list[dict[str, float]]:
@@ -52,7 +52,7 @@ def searched(log: Log, model: RobotModel) -> list[dict[str, float]]:
     middle = trial.variance
     for _ in range(ITERATIONS):
         # What the best member leaves is taken for noise.
-        floor = np.maximum(middle.min() / MEDIAN, FLOOR**2)
+        floor = np.maximum(middle.min() / MEDIAN_SQUARE, FLOOR**2)
         trial = fit.annealed(trial, frames, never_late, floor[None])
         middle = np.median(squared(fit.residual(trial.members, frames)), axis=-1)
     best = np.argsort(middle)[:RETURNED]
@@ -71,7 +71,7 @@ def _members(fit: Fit, model: RobotModel, frames: Frames) -> Members:
     latency = np.array(LATENCY[0])
     coarse = np.full(SCREENED_AT_ONCE, COARSE**2)
     parts = [_placed(fit, model, fit.start((), 1, latency), frames)]
-    for first in range(0, DRAWN, SCREENED_AT_ONCE):
+    for first in range(0, DRAWS, SCREENED_AT_ONCE):
         drawn = fit.spawned((), np.array(first), SCREENED_AT_ONCE, latency)
         placed = _placed(fit, model, drawn, frames)
         parts.append(fit.screened(placed, frames, coarse, KEPT))
