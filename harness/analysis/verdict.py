@@ -70,10 +70,10 @@ def judge(runs: pd.DataFrame) -> Verdict:
         return Verdict(_of_one_controller(chosen), tuple(cautions))
     winners = _winners(runs, ranked)
     rates = _of_several(chosen)
-    doubts = _doubts(chosen)
+    limits = (_doubts(chosen), *_with_few_seeds(chosen), *cautions)
     if not winners:
-        return Verdict(rates, (doubts, *cautions))
-    return Verdict(winners, (rates, doubts, *cautions))
+        return Verdict(rates, limits)
+    return Verdict(winners, (rates, *limits))
 
 
 def ranked_controllers(runs: pd.DataFrame) -> list[str]:
@@ -205,13 +205,27 @@ class _Standing(NamedTuple):
 
 def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
     """Return a sentence that names the best in each place, and by how much; empty where nothing is shown."""
-    known = [_standing(*each) for each in _competitions(runs, names)]
+    places = _competitions(runs, names)
+    known = [_standing(*each) for each in places if _can_decide(each[2])]
     if not any(len(each.equal) > 1 or each.behind or each.ahead for each in known):
         return ""
     groups: dict[tuple[object, ...], list[_Standing]] = {}
     for each in known:
         groups.setdefault(each.result, []).append(each)
-    return "; ".join(_clause(own, len(known)) for own in groups.values()) + "."
+    return "; ".join(_clause(own, len(places)) for own in groups.values()) + "."
+
+
+def _can_decide(place: pd.DataFrame) -> bool:
+    return place["seed"].nunique() >= MIN_PAIRS
+
+
+def _with_few_seeds(runs: pd.DataFrame) -> list[str]:
+    """Return a sentence on the places that have too few seeds for a verdict where others have enough."""
+    places = split_conditions(runs)
+    few = [words for words, place in places if not _can_decide(place)]
+    if len(few) in (0, len(places)):
+        return []
+    return [f"Shown, not judged, with fewer than {MIN_PAIRS} seeds: {_listed(few)}."]
 
 
 def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:

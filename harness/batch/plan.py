@@ -49,11 +49,19 @@ class Batch:
     robot: str = DEFAULT_ROBOT
     """a name or the path of a file; all runs of a batch have one"""
     sensings: tuple[str, ...] = (DEFAULT_SENSING,)
+    first_seed_on: tuple[str, ...] = ()
+    """further plants, which take the first seed only"""
 
-    def requests(self) -> Grid[RunRequest]:
-        """Return the runs, seeds varying fastest."""
+    def requests(self) -> Sequence[RunRequest]:
+        """Return the runs, seeds varying fastest; last those of the first seed only."""
+        runs = self._grid(self.plants, self.seeds)
+        if not self.first_seed_on:
+            return runs
+        return [*runs, *self._grid(self.first_seed_on, self.seeds[:1])]
+
+    def _grid(self, plants: Sequence[str], seeds: Sequence[int]) -> Grid[RunRequest]:
         is_default = self.mismatches == (DEFAULT_MISMATCH,)
-        own = {plant for plant in self.plants if is_default and find_plant(plant).own_robot}
+        own = {plant for plant in plants if is_default and find_plant(plant).own_robot}
 
         def run(
             sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
@@ -68,9 +76,7 @@ class Batch:
             )
 
         mismatches = [Mismatch.parse(text) for text in self.mismatches]
-        return Grid(
-            run, self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
-        )
+        return Grid(run, self.sensings, plants, self.tasks, mismatches, self.controllers, seeds)
 
 
 def parse_seeds(text: str) -> Sequence[int]:

@@ -116,6 +116,10 @@ def run(
 def compare(
     *,
     combinations: options.Combinations,
+    first_seed_on: Annotated[
+        str,
+        option("PLANTS", "Further plants, for the first seed only: bullet, for its pictures."),
+    ] = "",
     metric: options.MetricsOption = None,
     running: options.Batched,
     overrides: options.Overrides,
@@ -127,6 +131,9 @@ def compare(
     from servobench.harness.batch.campaign import comparison
 
     batch = combinations.batch()
+    if first_seed_on:
+        further = selection.split("plants", first_seed_on, robot=combinations.robot)
+        batch = replace(batch, first_seed_on=further)
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
     metrics = selection.choose_metrics(metric)
@@ -275,6 +282,7 @@ def _carry_out(
         titled_runs,
     )
     from servobench.harness.analysis.tables import summary_legend, summary_tables
+    from servobench.harness.analysis.verdict import judge as find_verdict
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.cli.progress import watching
@@ -313,4 +321,7 @@ def _carry_out(
                     missing_extra(error, "the page") if isinstance(error, ImportError) else None
                 )
                 say(f"no report: {missing or error}")
+        if len(runs) > 1:
+            finding = find_verdict(runs)
+            say("\n".join(["", finding.result, *finding.cautions, ""]).replace("`", ""))
     judge(opened, strict=strict, whole=how.part == (1, 1))

@@ -401,6 +401,21 @@ def test_cells_of_a_plan_are_made_one_by_one():
         grid[len(grid)]
 
 
+def test_further_plants_take_the_first_seed_only():
+    batch = Batch(
+        ("kinematic",), ("constant",), ("exp2", "circle"), ("none",), (3, 4), first_seed_on=("fmu",)
+    )
+    runs = [(run.plant, run.task, run.seed) for run in batch.requests()]
+    assert runs == [
+        ("kinematic", "exp2", 3),
+        ("kinematic", "exp2", 4),
+        ("kinematic", "circle", 3),
+        ("kinematic", "circle", 4),
+        ("fmu", "exp2", 3),
+        ("fmu", "circle", 3),
+    ]
+
+
 def test_a_survey_finds_what_the_runs_are_without_keeping_them():
     batch = Batch(
         ("kinematic", "fmu"), ("constant", "rls"), ("random",), ("none", "moderate"), (3, 4, 9, 5)

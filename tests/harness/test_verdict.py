@@ -57,6 +57,17 @@ def test_with_few_seeds_the_order_is_a_hint():
     assert unfinished.cautions[0].startswith("2 seeds are too few")
 
 
+def test_places_with_few_seeds_are_shown_beside_those_that_are_judged():
+    many = runs_of(8, a=1.0, b=2.0)
+    once = runs_of(1, a=2.0, b=1.0).assign(plant="bullet")
+    verdict = judge(pd.concat([many, once]))
+    assert "`a` is best in `exp1 on kinematic, moderate`" in verdict.result
+    assert "bullet" not in verdict.result
+    few = "Shown, not judged, with fewer than 6 seeds: `exp1 on bullet, moderate`."
+    assert few in verdict.cautions
+    assert not any("not judged" in each for each in judge(many).cautions)
+
+
 def test_the_first_sentence_names_the_best_and_by_how_much():
     result = judge(runs_of(8, a=1.0, b=2.0)).result
     assert result == "`a` is best: 1.00 s ahead of `b` in settling time."
