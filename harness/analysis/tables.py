@@ -345,7 +345,7 @@ def summary_legend(runs: pd.DataFrame) -> str:
     if len(runs) > 1:
         lines.append("numbers: medians over runs")
     if _is_late(runs):
-        lines.append(f"{LATE} some steps took longer than the period")
+        lines.append(f"{LATE} some steps took longer than the period; simulated time waits")
     return "\n".join(filter(None, lines))
 
 

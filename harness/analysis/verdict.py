@@ -186,6 +186,7 @@ class _Standing(NamedTuple):
     """The first of a place and the others in it."""
 
     where: str
+    first: str
     equal: tuple[str, ...]  # the first, and all that are shown to be practically equal to it
     undecided: tuple[str, ...]
     ahead: tuple[str, ...]  # shown to be better than the first, which has the higher success rate
@@ -199,7 +200,7 @@ class _Standing(NamedTuple):
     def result(self) -> tuple[object, ...]:
         """Everything but the place and the numbers: places with the same result share a clause."""
         only_lost = math.isnan(self.by)
-        contest = self.equal, self.undecided, self.ahead, self.behind
+        contest = self.first, self.equal, self.undecided, self.ahead, self.behind
         return (*contest, only_lost, self.metric, self.unit)
 
 
@@ -244,6 +245,7 @@ def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
         by = -against[behind].mean.value
     return _Standing(
         where=words,
+        first=order[0],
         equal=tuple(name for name in dict.fromkeys(own["controller"]) if name in best),
         undecided=tuple(having.get("undecided", ())),
         ahead=tuple(having.get("worse", ())),
@@ -271,9 +273,12 @@ def _clause(places: Sequence[_Standing], count: int) -> str:
         parts.append(f"equal within {widest:.2g} {one.unit}")
     only_lost = math.isnan(one.by)  # the same in all of these places
     if one.behind and not only_lost:
-        parts.append(f"{_range([each.by for each in places])} {one.unit} ahead of `{one.behind}`")
+        lead = f"{_range([each.by for each in places])} {one.unit} ahead of `{one.behind}`"
+        if many:
+            lead = f"and `{one.first}` is {lead}"
+        parts.append(lead)
     if parts:
-        words += f": {' and '.join(parts)} in {label}"
+        words += f": {', '.join(parts)} in {label}"
     if one.behind and only_lost:
         words += f", losing fewer runs than `{one.behind}`"
     if one.undecided:
@@ -393,10 +398,16 @@ def _shares(runs: pd.DataFrame) -> dict[str, float]:
 
 
 def _share(runs: pd.DataFrame) -> str:
-    """Return how many runs were successful, with the interval of their share."""
+    """Return how many runs of a controller were successful.
+
+    The interval of their share is told where no two of them share a robot.
+    """
     good = int(outcomes(runs).isin(ACHIEVED).sum())
+    counts = f"{good} of {len(runs)} runs"
+    if not runs["seed"].is_unique:
+        return counts
     share = achieved_share(runs)
-    return f"{good} of {len(runs)} runs (95 % interval: {share.low:.0f} to {share.high:.0f} %)"
+    return f"{counts} (95 % interval: {share.low:.0f} to {share.high:.0f} %)"
 
 
 def _listed(names: Sequence[str], most: int = NAMED) -> str:

@@ -15,7 +15,9 @@ PASTED = re.compile(r" {4}(servobench|pip|python3?|for) ")
 SAVED = re.compile(r"`([\w/-]+\.\w+)`:\s*$")  # the line before a block that is a file
 ELLIPSIS = "..."
 PROGRESS = re.compile(r"^(running|training)\b.*[━╸]|^report: ")  # times and sizes differ
-VARYING = re.compile(r" \* some steps took longer than the period|\d+ (?=figures)")  # 1: when busy
+VARYING = re.compile(
+    r" \* some steps took longer than the period; simulated time waits|\d+ (?=figures)"
+)  # 1: when busy
 SLOW = re.compile(r"^note +time .*longer than the period.*$")  # of a check, when busy
 # The last column of a table of runs: microseconds of wall clock
 CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")
