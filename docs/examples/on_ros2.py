@@ -140,7 +140,7 @@ class Link:
             self.captured = self.stamps[BALL]
             self.posture = q
         # A picture that stays the same while the joints move is frozen
-        found = found and np.ptp(q - self.posture) < STILL
+        found = found and not np.ptp(q - self.posture) >= STILL
         self.lost = 0 if found else self.lost + 1
         if self.lost > 1:
             self.end(f"{BALL}: not found, or the same in two frames while the joints move")
