@@ -35,8 +35,6 @@ except ImportError:
     Writer = None
 
 JOINTS, BALL, COMMANDS = "joint_states", "ball", "forward_velocity_controller/commands"
-WAIT = 20.0  # [s] of the wall clock for messages and for a robot that follows
-STILL = 1e-3  # [rad] by which joints may move while frames show the same to the last bit
 
 
 @dataclass(frozen=True)
@@ -56,6 +54,7 @@ class ROS2Config:
     box: tuple[float, ...] = (-1.0, -1.0, 0.0, 1.0, 1.0, 1.5)
     """[m] lower and upper corner for the ball, base frame"""
     patience: float = 1.5  # [control periods] for messages and for the controller
+    still: float = 1e-3  # [rad] by which joints may move while frames show the same to the last bit
     simulated: bool = False  # time is that of /clock
     dry_run: bool = False  # command nothing
     bag: str = ""  # folder of a new rosbag2 with all messages
@@ -79,6 +78,7 @@ class Link:
         self.lost = 1
         self.sent = deque(maxlen=100)
         self.feature = None
+        self.unmoved = np.nan
         self.fault = ""
 
     @property
@@ -98,8 +98,7 @@ class Link:
 
     def hear_ball(self, message, now):
         """Take the ball's centre in the camera frame [m]; NaN where the frame does not show it."""
-        point = message.point
-        self.hear(BALL, message, [point.x, point.y, point.z], now)
+        self.hear(BALL, message, [message.point.x, message.point.y, message.point.z], now)
 
     def hear(self, topic, message, numbers, now):
         """Take a message if its stamp is later than those before."""
@@ -135,16 +134,18 @@ class Link:
         ball = self.news.pop(BALL)
         self.began = self.came
         found = np.isfinite(ball).all()
-        if found and not np.array_equal(ball, self.feature):
+        if found:
+            if not np.array_equal(ball, self.feature):
+                # Unknown for the first picture, which is the same until the arm is seen to move
+                self.posture = q + self.unmoved
+                self.unmoved = 0.0
             self.feature = ball
             self.captured = self.stamps[BALL]
-            self.posture = q
         # A picture that stays the same while the joints move is frozen
-        found = found and not np.ptp(q - self.posture) >= STILL
+        found = found and not np.ptp(q - self.posture) >= self.config.still
         self.lost = 0 if found else self.lost + 1
         if self.lost > 1:
-            self.end(f"{BALL}: not found, or the same in two frames while the joints move")
-        self.check()
+            raise RuntimeError(f"{BALL}: not found, or the same in two frames as the joints move")
         self.q = q
         now = self.k * self.spec.period
         self.k += 1
@@ -153,8 +154,7 @@ class Link:
     def send(self, velocity, now):
         """Return the joint velocities to publish, (n,) [rad/s], or raise why there are none."""
         self.watch(now)
-        limit = self.spec.joint_velocity_limit
-        v = np.clip(velocity, -limit, limit)
+        v = np.clip(velocity, self.spec.command.lower, self.spec.command.upper)
         ahead = self.q + 2.0 * self.spec.period * v
         ends = np.append(ahead, self.arm.ball(self.arm.frames(ahead)))
         if not np.array_equal(ends, np.clip(ends, self.low, self.high)):
@@ -180,8 +180,10 @@ class ROS2(servobench.Plant):
 
     def reset(self, seed):
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        clock = rclpy.Parameter("use_sim_time", value=self.config.simulated)
-        self.node = rclpy.create_node("controller", parameter_overrides=[clock])
+        self.node = rclpy.create_node(
+            "controller",
+            parameter_overrides=[rclpy.Parameter("use_sim_time", value=self.config.simulated)],
+        )
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         if self.config.bag:
@@ -235,14 +237,13 @@ class ROS2(servobench.Plant):
 
     def observe(self):
         with self.turn:
-            if not self.turn.wait_for(self.may_go_on, WAIT):
+            if not self.turn.wait_for(self.may_go_on, 20.0):  # [s] of the wall clock
                 self.link.end(f"{JOINTS} and {BALL} do not come, or nobody follows {COMMANDS}")
             return self.link.observe()
 
     def may_go_on(self):
         # This node hears its own commands
-        followed = self.commands.get_subscription_count() > 1
-        return self.link.fault or (self.link.ready and followed)
+        return self.link.fault or (self.link.ready and self.commands.get_subscription_count() > 1)
 
     def step(self, command):
         with self.turn:
