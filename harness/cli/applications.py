@@ -30,7 +30,7 @@ class Application(NamedTuple):
 
 APPLICATIONS: Final = {
     "twin": Application("arm, camera and drive identified from a log", ("shadow", "identify")),
-    "serve": Application("a plant on the ports of a UR", ("serve",)),
+    "serve": Application("a plant on the ports of a UR, or as a robot of ROS 2", ("serve",)),
     "check": Application("a plug-in begun, and held against its contract", ("new", "check")),
     "fmu": Application(
         "arms and controllers as FMUs", ("fmu",), further=("servobench.fmus.controllers",)

@@ -25,7 +25,7 @@ EXAMPLES = {
 
 LOOKING = {"look_then_move"}  # tested below
 LEARNING = {"train_policy", "learned_policy"}  # tested below
-ROBOTS = {"on_a_ur"}  # tests/end_to_end/test_on_a_ur.py
+ROBOTS = {"on_a_ur", "on_ros2"}  # tests/apps/serve
 MOTIONS = {"excite"}  # tests/harness/test_identification.py moves an arm by it
 LAWS = {
     "damped_inverse": "DampedInverse",

@@ -15,7 +15,7 @@ import struct
 from asyncio import StreamReader, StreamWriter
 from collections.abc import Awaitable, Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final, TypeAlias, final
 
@@ -28,26 +28,18 @@ from servobench.harness.apps.serve.program import (
     begins_script,
     script_version,
 )
+from servobench.harness.apps.serve.served import RATE, Served
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build
-from servobench.harness.run.feasibility import check_possible
-from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolution import check_settings, resolve
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.files import reason
-from servobench.plant.contract.seeds import named_seed
-from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 
 Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
 # All but the last are UR's
 PORTS: Final = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}
-RATE: Final = 500.0  # [Hz] rate of the controller of an e-Series robot
 HEARTBEAT: Final = 0.004  # [s] between two packets while lockstep waits
-BACKLOG: Final = 0.1  # [s] behind the wall clock from which the backlog is dropped
 SEND_BUFFER: Final = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
 PACKETS_A_PERIOD: Final = 50  # packets of a client in a period; the others wait
 SCRIPT_SIZE: Final = 1 << 20  # bytes of a script at most
@@ -96,28 +88,15 @@ class Server:
             ConfigurationError: a name or setting that cannot be used, or an arm without six joints.
             RunFault: the run cannot begin.
         """
-        check_settings(settings, [request.plant, request.task])
-        resolved = resolve(request, settings)
         self._arm = find_robot(request.robot).arm
         if self._arm.n != 6:
             raise ConfigurationError(
                 f"--robot must be one with 6 joints, as every UR has, got {self._arm.n}"
             )
-        sensing = getattr(resolved.plant, "sensing", None)
-        frames = resolved.run.period
-        if not lockstep:
-            if isinstance(sensing, SensingConfig):
-                frames = sensing.frame_period or frames
-                plant = replace(resolved.plant, sensing=replace(sensing, frame_period=frames))
-                resolved = replace(resolved, plant=plant)
-            resolved = replace(resolved, run=replace(resolved.run, period=1.0 / RATE))
-        experiment = build(resolved)
-        check_possible(resolved, experiment.drawn, experiment.plant.spec)
-        self._plant = experiment.plant
-        self._spec = experiment.plant.spec
-        first = self._plant.reset(named_seed(request.seed, "plant"))
-        self.rollout = Rollout(self._plant, first, experiment.desired(), experiment.loop)
-        self._frames = max(1, round(frames / self._spec.period))
+        self._served = Served(request, settings, say, lockstep=lockstep)
+        self._plant = self._served.plant
+        self._spec = self._plant.spec
+        self.rollout = self._served.rollout
         self._say = say
         self._lockstep = lockstep
         # For its lag and its command delay
@@ -131,7 +110,6 @@ class Server:
         self._crowded: set[str] = set()  # ports at which a connection had to give way
         self._fault: str | None = None
         self._sent = 0
-        self._untold = 0
         self._turn = asyncio.Event()
         self.state: dict[str, Any] = {
             **wire.CONTROLLER["constant"],
@@ -183,12 +161,7 @@ class Server:
                 if self._lockstep:
                     await asyncio.sleep(0.0 if self.program.busy else HEARTBEAT)
                 else:
-                    due += self._spec.period
-                    if (late := clock() - due) > BACKLOG:
-                        self._say(
-                            f"the plant is slower than the wall clock: {1e3 * late:.0f} ms are left out"
-                        )
-                        due += late
+                    due = self._served.next_period(due, clock())
                     await asyncio.sleep(max(0.0, due - clock()))
                     self.program.cycle()
                 if self.program.busy or not self._lockstep:
@@ -243,19 +216,13 @@ class Server:
         velocity = self.program.advance()
         if self._fault is None:
             try:
-                self.rollout.advance(Command(velocity))
+                has_frame = self._served.advance(velocity)
             except (RunFault, FloatingPointError) as error:
                 self._fault = str(error)
                 self.program.protect(self._fault)
             else:
                 self._measure()
-                self._untold += 1
-                if (
-                    self._lockstep
-                    or self.rollout.observation.valid.any()
-                    or self._untold > self._frames
-                ):
-                    self._untold = 0
+                if has_frame:
                     self._tell(self._watchers)
 
     def _measure(self) -> None:
