@@ -18,6 +18,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "optuna": "tune",
     "distributed": "cluster",
     "gymnasium": "gym",
+    "onnxruntime": "onnx",
     "mcap": "mcap",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
