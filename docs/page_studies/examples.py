@@ -1,0 +1,126 @@
+"""Controllers of docs/examples beside methods of the bench: rivals, tuned and untuned, and trained policies."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from page_studies import cells
+from page_studies.study import BETTER, Study, Words, sweep
+from servobench.harness.batch.results import load_runs
+
+FOLDER: Final = Path("docs") / "examples"
+# File -> its class; with `Alone` at the end it is the one without aids
+RIVALS: Final = {"adrc.py": "Adrc", "pfdl_mfac.py": "PfdlMfac"}
+BESIDE: Final = (BETTER, "ukf_mfac", "ukf_mfac:published", "cfdl_mfac:published")
+TRAININGS: Final = (0, 1, 2)  # seeds
+UNTRAINED: Final = "untrained"
+# From the hash of the last commit that changed code before they were drawn: 62fa3
+FIRST: Final = 405411
+ROBOTS: Final = f"{FIRST}:{FIRST + 60}"
+MANY_ROBOTS: Final = f"{FIRST}:{FIRST + 200}"
+
+
+def here(folder: Path) -> Path:
+    """Return a folder as seen from the one in which the commands are carried out."""
+    return Path(os.path.relpath(folder))
+
+
+def classes(folder: Path) -> list[str]:
+    """Return the places of the classes of all rivals, whose files are in a folder."""
+    return [
+        f"{folder / file}:{name}{end}" for file, name in RIVALS.items() for end in ("", "Alone")
+    ]
+
+
+def tuned() -> Words:
+    """Return the sweep of the rivals with their tuned values, and of methods of the bench."""
+    places = [f"./{place}" for place in classes(FOLDER / "rivals")]
+    return sweep("kinematic", (*places, *BESIDE), "random,circle", ROBOTS)
+
+
+def untuned(folder: Path) -> Words:
+    """Return the sweep of copies of the rivals without the files of tuned values."""
+    copies = here(folder) / "untuned_code"
+    copies.mkdir(exist_ok=True)
+    for file in RIVALS:
+        shutil.copy(FOLDER / "rivals" / file, copies)
+    return sweep("kinematic", classes(copies), "random,circle", ROBOTS)
+
+
+def rivals_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return how fast methods settle and how well they follow, a row a method and its values."""
+    parts = {part: load_runs(folder / part) for part in RIVALS_STUDY.commands}
+    rows = []
+    for values, runs in parts.items():
+        for name, own in cells.by_method(runs):
+            described = values
+            if name in BESIDE:
+                described = "as published" if ":" in name else "tuned"
+            moves, curves = (own[own["task"] == task] for task in ("random", "circle"))
+            row = {
+                "controller": cells.quoted(name.partition(":")[0]),
+                "values": described,
+                "settling, s": cells.settling(moves),
+                "error of the circle, mm": cells.millimetres(curves),
+            }
+            rows.append(row)
+    return {"rivals": pd.DataFrame(rows).sort_values("controller", kind="stable")}
+
+
+def policy_file(folder: Path, seed: int) -> Path:
+    """Return where the policy of a training is."""
+    return here(folder) / f"policy_{seed}.onnx"
+
+
+def judged(folder: Path) -> Words:
+    """Return the sweep of all policies and the better method."""
+    names = [f"training_{seed}={policy_file(folder, seed)}" for seed in TRAININGS]
+    names.append(f"{UNTRAINED}={here(folder) / UNTRAINED}.onnx")
+    moves = sweep("kinematic", (*names, BETTER), "random", MANY_ROBOTS)
+    return (*moves, "--mismatch", "moderate,severe")
+
+
+def policies_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return how many robots settle, how fast and how near, a row a policy and a mismatch."""
+    rows = []
+    for mismatch, runs in load_runs(folder / "judged").groupby("mismatch", sort=False):
+        for name, own in cells.by_method(runs):
+            row = {
+                "controller": cells.quoted(name) if name == BETTER else name.replace("_", " "),
+                "mismatch": cells.quoted(str(mismatch)),
+                "settled": f"{cells.settled(own)} of {len(own)}",
+                "settling, s": cells.settling(own),
+                "error of the last second, mm": cells.millimetres(own, "steady_state_error"),
+            }
+            rows.append(row)
+    return {"policies": pd.DataFrame(rows)}
+
+
+def training(*options: str) -> Words:
+    """Return the arguments of the training of a policy."""
+    return (str(FOLDER / "train_policy.py"), *options)
+
+
+RIVALS_STUDY: Final = Study(
+    "rivals",
+    "ADRC and PFDL-MFAC as laws of one's own, tuned and untuned: 60 robots",
+    4,
+    {"tuned": tuned(), "untuned": untuned},
+    rivals_table,
+)
+POLICIES: Final = Study(
+    "policies",
+    "three trainings of a policy, judged on 200 robots",
+    12,
+    {
+        **{f"policy_{seed}.onnx": training("--seed", str(seed)) for seed in TRAININGS},
+        f"{UNTRAINED}.onnx": training("--rounds", "0"),
+        "judged": judged,
+    },
+    policies_table,
+)
