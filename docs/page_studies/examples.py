@@ -11,6 +11,7 @@ import pandas as pd
 
 from page_studies import cells
 from page_studies.study import BETTER, Study, Words, sweep
+from servobench.harness.analysis.comparison import median_with_interval, settling_times
 from servobench.harness.batch.results import load_runs
 
 FOLDER: Final = Path("docs") / "examples"
@@ -77,27 +78,39 @@ def policy_file(folder: Path, seed: int) -> Path:
     return here(folder) / f"policy_{seed}.onnx"
 
 
-def judged(folder: Path) -> Words:
-    """Return the sweep of all policies and the better method."""
+def controllers(folder: Path) -> list[str]:
+    """Return the better method and all policies."""
     names = [f"training_{seed}={policy_file(folder, seed)}" for seed in TRAININGS]
-    names.append(f"{UNTRAINED}={here(folder) / UNTRAINED}.onnx")
-    moves = sweep("kinematic", (*names, BETTER), "random", MANY_ROBOTS)
+    return [*names, f"{UNTRAINED}={here(folder) / UNTRAINED}.onnx", BETTER]
+
+
+def judged(folder: Path) -> Words:
+    """Return the sweep of the policies on moves, as they were trained on, and of the better method."""
+    moves = sweep("kinematic", controllers(folder), "random", MANY_ROBOTS)
     return (*moves, "--mismatch", "moderate,severe")
 
 
+def judged_on_curves(folder: Path) -> Words:
+    """Return the same sweep on the circle, which no policy was trained on."""
+    return sweep("kinematic", controllers(folder), "circle", MANY_ROBOTS)
+
+
 def policies_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return how many robots settle, how fast and how near, a row a policy and a mismatch."""
+    """Return how many robots settle, how fast and how near, and how well policies follow, a row a policy."""
+    runs = pd.concat(load_runs(folder / part) for part in ("judged", "curves"))
     rows = []
-    for mismatch, runs in load_runs(folder / "judged").groupby("mismatch", sort=False):
-        for name, own in cells.by_method(runs):
-            row = {
-                "controller": cells.quoted(name) if name == BETTER else name.replace("_", " "),
-                "mismatch": cells.quoted(str(mismatch)),
-                "settled": f"{cells.settled(own)} of {len(own)}",
-                "settling, s": cells.settling(own),
-                "error of the last second, mm": cells.millimetres(own, "steady_state_error"),
-            }
-            rows.append(row)
+    for name, own in cells.by_method(runs):
+        row = {"controller": cells.quoted(name) if name == BETTER else name.replace("_", " ")}
+        moves = own[own["task"] == "random"]
+        for mismatch, there in moves.groupby("mismatch", sort=False):
+            row[f"settled, `{mismatch}`"] = f"{cells.settled(there)} of {len(there)}"
+            row[f"settling, s, `{mismatch}`"] = cells.short(
+                median_with_interval(settling_times(there)), 2
+            )
+        usual = moves[moves["mismatch"] == "moderate"]
+        row["error of the last second, mm"] = cells.millimetres(usual, "steady_state_error")
+        row["error of the circle, mm"] = cells.millimetres(own[own["task"] == "circle"])
+        rows.append(row)
     return {"policies": pd.DataFrame(rows)}
 
 
@@ -110,17 +123,18 @@ RIVALS_STUDY: Final = Study(
     "rivals",
     "ADRC and PFDL-MFAC as laws of one's own, tuned and untuned: 60 robots",
     4,
-    {"tuned": tuned(), "untuned": untuned},
+    {"untuned": untuned, "tuned": tuned()},
     rivals_table,
 )
 POLICIES: Final = Study(
     "policies",
     "three trainings of a policy, judged on 200 robots",
-    12,
+    15,
     {
         **{f"policy_{seed}.onnx": training("--seed", str(seed)) for seed in TRAININGS},
         f"{UNTRAINED}.onnx": training("--rounds", "0"),
         "judged": judged,
+        "curves": judged_on_curves,
     },
     policies_table,
 )
