@@ -1,7 +1,4 @@
-# /// script
-# dependencies = ["servobench[onnx]", "onnx>=1.17"]
-# ///
-"""Train a policy with a memory on many robots at once, and write it as ONNX; numpy and a few minutes are enough.
+"""Train a policy with a memory on many robots at once, and write it as ONNX; numpy and some minutes are enough.
 
     pip install onnx    # and servobench with its extra onnx
     python train_policy.py --out policy.onnx
