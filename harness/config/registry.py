@@ -10,7 +10,7 @@ import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -23,6 +23,7 @@ from servobench.harness.config.entries import (
     PLANT,
     Entry,
     Kind,
+    NoSettings,
     Own,
     own_object,
     read_own,
@@ -262,8 +263,9 @@ def _made_controller(name: str) -> ControllerEntry | None:
         check_installed(("onnxruntime", "gymnasium"), f"controller {name!r}")
         module = import_module("servobench.harness.gym.policy")  # an application, so no import
         path = user_path(name.removeprefix(POLICY))
-        entry: ControllerEntry = module.policy_controller(path, name)
-        return entry
+        return ControllerEntry(
+            name, f"the policy {path.name}", NoSettings, partial(module.Policy, path)
+        )
     law, plus, estimator = name.partition("+")
     if not plus:
         return None

@@ -13,21 +13,18 @@ All are floats of 32 bits; an axis whose length is not fixed has the length 1. A
 an observation has gets the stamps of frames, too.
 """
 
-from functools import partial
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, final
 
 import numpy as np
 from onnxruntime import InferenceSession, SessionOptions
 
-from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.harness.config.entries import NoSettings
 from servobench.harness.gym.environment import Floats32, Spaces
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.signals import Command, Observation
-
-NEXT: Final = "_next"  # end of the name of an output that is the next value of an input
 
 
 @final
@@ -49,7 +46,7 @@ class Policy(Controller):
         self._first = {port.name: _zeros(port.shape) for port in self._session.get_inputs()}
         self._seen, *memory = self._first
         action = self._session.get_outputs()[0].name
-        self._outputs = [action, *(name + NEXT for name in memory)]
+        self._outputs = [action, *(name + "_next" for name in memory)]
         came = self._first[self._seen].size
         size = Spaces(knowledge.spec, knowledge.preview).observations.shape[0]
         self._spaces = Spaces(knowledge.spec, knowledge.preview, stamps=came > size)
@@ -92,15 +89,7 @@ class Policy(Controller):
         return Command(self._spaces.command(self._action))
 
 
-def policy_controller(path: Path, name: str) -> ControllerEntry:
-    """Return the entry of the controller called `name`, a policy in an ONNX file."""
-    return ControllerEntry(name, f"the policy {path.name}", NoSettings, partial(Policy, path))
-
-
 def _zeros(shape: list[Any]) -> Floats32:
     """Return zeros, with an axis of length 1 where it has a name, or none, in place of a length."""
-    lengths = list(shape)
-    for axis, length in enumerate(shape):
-        if not isinstance(length, int):
-            lengths[axis] = 1
+    lengths = [length if isinstance(length, int) else 1 for length in shape]
     return np.zeros(lengths, np.float32)
