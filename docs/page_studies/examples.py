@@ -54,23 +54,19 @@ def untuned(folder: Path) -> Words:
 
 
 def rivals_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return how fast methods settle and how well they follow, a row a method and its values."""
+    """Return how fast methods settle and how well they follow, untuned and tuned, a row a method."""
     parts = {part: load_runs(folder / part) for part in RIVALS_STUDY.commands}
+    kinds = {"settling, s": ("random", cells.settling), "circle, mm": ("circle", cells.millimetres)}
     rows = []
-    for values, runs in parts.items():
-        for name, own in cells.by_method(runs):
-            described = values
-            if name in BESIDE:
-                described = "as published" if ":" in name else "tuned"
-            moves, curves = (own[own["task"] == task] for task in ("random", "circle"))
-            row = {
-                "controller": cells.quoted(name.partition(":")[0]),
-                "values": described,
-                "settling, s": cells.settling(moves),
-                "error of the circle, mm": cells.millimetres(curves),
-            }
-            rows.append(row)
-    return {"rivals": pd.DataFrame(rows).sort_values("controller", kind="stable")}
+    for name, _ in cells.by_method(parts["tuned"]):
+        row = {"controller": cells.quoted(name)}
+        for heading, (task, cell) in kinds.items():
+            for part, runs in parts.items():
+                of_task = runs[runs["task"] == task]
+                own = of_task[of_task["controller"] == name]
+                row[f"{heading}, {part}"] = cell(own) if len(own) else ""
+        rows.append(row)
+    return {"rivals": pd.DataFrame(rows)}
 
 
 def policy_file(folder: Path, seed: int) -> Path:
@@ -103,13 +99,11 @@ def policies_table(folder: Path) -> dict[str, pd.DataFrame]:
         row = {"controller": cells.quoted(name) if name == BETTER else name.replace("_", " ")}
         moves = own[own["task"] == "random"]
         for mismatch, there in moves.groupby("mismatch", sort=False):
-            row[f"settled, `{mismatch}`"] = f"{cells.settled(there)} of {len(there)}"
-            row[f"settling, s, `{mismatch}`"] = cells.short(
-                median_with_interval(settling_times(there)), 2
-            )
+            time = cells.short(median_with_interval(settling_times(there)), 2)
+            row[f"settling, s, `{mismatch}`"] = f"{time}, {cells.settled(there)}/{len(there)}"
         usual = moves[moves["mismatch"] == "moderate"]
-        row["error of the last second, mm"] = cells.millimetres(usual, "steady_state_error")
-        row["error of the circle, mm"] = cells.millimetres(own[own["task"] == "circle"])
+        row["rest, mm"] = cells.millimetres(usual, "steady_state_error")
+        row["circle, mm"] = cells.millimetres(own[own["task"] == "circle"])
         rows.append(row)
     return {"policies": pd.DataFrame(rows)}
 
