@@ -189,7 +189,7 @@ def stamp(study: Study, folder: Path) -> dict[str, str]:
         part: (folder / f"{part}{DONE}").read_text(encoding="utf-8") for part in study.commands
     }
     carried_out = [part for part, command in commands.items() if command]
-    first = folder / carried_out[0]
+    first = next(folder / part for part in carried_out if (folder / part).is_dir())
     # A suite's, one for each challenge
     parts = sorted(path.parent for path in first.glob(f"*/{results.MANIFEST}"))
     manifest = ResultsFolder(parts[0] if parts else first).manifest

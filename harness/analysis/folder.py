@@ -9,7 +9,7 @@ from servobench.controllers.aids import describe_aids
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
 from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.config.registry import CONTROLLERS, MAPPED
+from servobench.harness.config.registry import CONTROLLERS, FILES
 from servobench.harness.config.settings import tuned_settings
 from servobench.harness.config.source import find_place
 from servobench.harness.run.own_metrics import declare_metrics
@@ -78,7 +78,7 @@ def describe_controllers(
     for name, label in names.items():
         values = configuration.get(name)
         place = own.get(name, {}).get("place", name)
-        known = values is not None and not place.startswith(MAPPED)
+        known = values is not None and not place.startswith(FILES)
         words = describe_aids(values) if known else "aids unknown"
         found.setdefault(words, []).append(label)
     return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
@@ -111,7 +111,7 @@ def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> lis
     places = []
     for name in names:
         place = own.get(name, {}).get("place", name)
-        if name in known or knows_truth(name) or place.startswith(MAPPED):
+        if name in known or knows_truth(name) or place.startswith(FILES):
             continue
         untuned.append(name)
         if name in own and find_place(place):

@@ -10,7 +10,7 @@ import pandas as pd
 
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.description import plain, restored
-from servobench.harness.config.registry import MAPPED
+from servobench.harness.config.registry import FILES
 from servobench.harness.config.settings import Settings, flatten, nest
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections
@@ -31,7 +31,7 @@ PER_SECOND: Final = {"ms": 1e3, "µs": 1e6, "ns": 1e9}  # counts of a clock
 TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
 # In names of plants, controllers and set-ups
-CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.(?i:py)(:|$)")
+CODE: Final = re.compile(rf"^({'|'.join(FILES)})|\.(?i:py)(:|$)")
 TASK: Final = "circle"  # likewise, without effect
 RENAMED: Final = {  # counts of control periods up to 0.2.0 -> times
     f"initial.{word}_periods": f"initial.{word}_time" for word in ("probe", "settle", "average")

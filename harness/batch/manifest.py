@@ -13,7 +13,7 @@ from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
 from servobench.harness.config.registry import (
     CONTROLLER_REGISTRY,
-    MAPPED,
+    FILES,
     PLANT_REGISTRY,
     Offer,
     find_plant,
@@ -197,8 +197,8 @@ def _names(
             str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value
         )
     for name in (*runs.plants, *runs.controllers, *(each.place for each in own)):
-        if name.startswith(MAPPED):
-            path = name.removeprefix(MAPPED)
+        if name.startswith(FILES):
+            path = name.partition(":")[2]
             yield path
             if path.lower().endswith(".toml"):
                 yield str(

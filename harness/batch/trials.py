@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from servobench.harness.config.registry import (
-    MAPPED,
+    FILES,
     REGISTRIES,
     Registry,
     find_controller,
@@ -129,7 +129,7 @@ def choose(word: Word, given: str) -> str:
         ConfigurationError: there is none, or it cannot be used; one line with file and line number.
     """
     registry = _registry(word)
-    place = None if given.startswith(MAPPED) or given in registry.names() else find_place(given)
+    place = None if given.startswith(FILES) or given in registry.names() else find_place(given)
     if place is not None and place["module"]:
         count_as_users(place["module"])
     if place is not None or registry.published(given) is not None:

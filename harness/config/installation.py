@@ -18,6 +18,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "optuna": "tune",
     "distributed": "cluster",
     "gymnasium": "gym",
+    "onnxruntime": "onnx",
     "mcap": "mcap",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
@@ -59,9 +60,10 @@ def check_installed(modules: tuple[str, ...], user: str) -> None:
 
 
 def _line(module: str, user: str) -> str:
-    line = f"{user} needs {module}: pip install " + (
-        f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module
-    )
+    wanted = module
+    if module in EXTRAS:
+        wanted = f"'servobench[{EXTRAS[module]}]'"
+    line = f"{user} needs {module}: pip install {wanted}"
     if module == "pybullet" and has_no_wheel():
         version = ".".join(map(str, sys.version_info[:2]))
         line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"

@@ -9,8 +9,9 @@ import contextlib
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final, Generic, TypeAlias
@@ -22,6 +23,7 @@ from servobench.harness.config.entries import (
     PLANT,
     Entry,
     Kind,
+    NoSettings,
     Own,
     own_object,
     read_own,
@@ -42,6 +44,8 @@ PLANTS = {
 RENDERED = ("bullet", "mujoco")  # a run without a named plant is on the first one that is installed
 UNRENDERED = "kinematic"  # its plant where none of them is
 MAPPED = "fmu:"
+POLICY: Final = "onnx:"
+FILES: Final = (MAPPED, POLICY)  # with which names begin that are those of files
 ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {
@@ -49,7 +53,7 @@ NOT_COMPOSED = {
     "revealed": "servobench.controllers.revealed:ENTRY",
 }
 CONTROLLERS: Final[Mapping[str, ControllerEntry | str]] = {**METHODS, **NOT_COMPOSED}
-MAPPINGS: Final = (".fmu", ".toml")  # endings of an FMU, or of a mapping of its names
+MAPPINGS: Final = {".fmu": MAPPED, ".toml": MAPPED}  # an FMU, or a mapping of its names
 
 Offer: TypeAlias = Own[Any]
 _OFFERED: dict[str, Offer] = {}
@@ -97,7 +101,7 @@ class Registry(Generic[Entry]):
     # makes the entry of a name with a meaning of its own; None for other names
     made: Callable[[str], Entry | None] = lambda _: None
     advice: Callable[[str], str] = lambda _: ""  # about an unknown name; empty for the nearest name
-    suffixes: tuple[str, ...] = ()  # suffixes of files whose name is `fmu:PATH`
+    files: Mapping[str, str] = field(default_factory=dict)  # suffix -> what their name begins with
 
     def names(self) -> list[str]:
         """Return all names, those of this package first."""
@@ -130,16 +134,17 @@ class Registry(Generic[Entry]):
         """
         if not isinstance(given, str):
             return self.offer(own_object(self.kind, given))
-        if given.lower().endswith(self.suffixes):
+        prefix = self.files.get(Path(given).suffix.lower())
+        if prefix is not None:
             alias, given = _split_alias(given)
-            if not given.startswith(MAPPED):
-                given = f"{MAPPED}{given}"
+            if not given.startswith(prefix):
+                given = f"{prefix}{given}"
             if alias:
                 entry = self.kind.make_entry(self.find(given), given, alias)
                 return self.offer(Own(self.kind.word, entry, given))
         if (
             given not in (*_OFFERED, *self.names())
-            and not given.startswith(MAPPED)
+            and not given.startswith(FILES)
             and is_place(given)
         ):
             return self.offer(read_own(self.kind, given))
@@ -249,11 +254,18 @@ def _mapped_plant(name: str) -> PlantEntry | None:
 
 
 def _made_controller(name: str) -> ControllerEntry | None:
-    """Return the controller of a name `fmu:PATH`, or that of a pair such as `mfac+rls`."""
+    """Return the controller of a name `fmu:PATH` or `onnx:PATH`, or that of a pair such as `mfac+rls`."""
     if name.startswith(MAPPED):
         from servobench.harness.config.fmu_controller import mapped_controller  # noqa: PLC0415 - as of plants
 
         return mapped_controller(user_path(name.removeprefix(MAPPED)), name)
+    if name.startswith(POLICY):
+        check_installed(("onnxruntime", "gymnasium"), f"controller {name!r}")
+        module = import_module("servobench.harness.gym.policy")  # an application, so no import
+        path = user_path(name.removeprefix(POLICY))
+        return ControllerEntry(
+            name, f"the policy {path.name}", NoSettings, partial(module.Policy, path)
+        )
     law, plus, estimator = name.partition("+")
     if not plus:
         return None
@@ -261,11 +273,14 @@ def _made_controller(name: str) -> ControllerEntry | None:
         return compose(law, estimator)
 
 
-PLANT_REGISTRY: Final = Registry(
-    PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=MAPPINGS
-)
+PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, files=MAPPINGS)
 CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
-    CONTROLLER, "servobench.controllers", CONTROLLERS, _made_controller, suggest_pair, MAPPINGS
+    CONTROLLER,
+    "servobench.controllers",
+    CONTROLLERS,
+    _made_controller,
+    suggest_pair,
+    {**MAPPINGS, ".onnx": POLICY},
 )
 REGISTRIES: Final[Mapping[str, Registry[Any]]] = {
     "plant": PLANT_REGISTRY,

@@ -545,6 +545,11 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             return None
         return self._rollout.observation
 
+    @property
+    def truth(self) -> Truth:
+        """The true features, (num_envs, m), and their Jacobian, for teachers and critics; there after `reset`."""
+        return self._bench.truth()
+
     def _observe(self) -> Floats32:
         return self._spaces.observe(
             self._rollout.observation, self._rollout.reference, self._action

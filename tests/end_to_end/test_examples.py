@@ -2,9 +2,6 @@
 
 import re
 import runpy
-import shutil
-import sys
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +9,7 @@ import pytest
 import servobench
 from kit.documents import ROOT
 from kit.nightly import some
-from servobench.harness.gym.environment import ServoEnv
+from servobench.harness.gym.environment import ServoEnv, ServoVectorEnv
 
 FOLDER = ROOT / "docs" / "examples"
 EXAMPLES = {
@@ -24,7 +21,7 @@ EXAMPLES = {
 
 
 LOOKING = {"look_then_move"}  # tested below
-LEARNING = {"train_policy", "learned_policy"}  # tested below
+LEARNING = {"train_policy"}  # tested below
 ROBOTS = {"on_a_ur", "on_ros2"}  # tests/apps/serve
 MOTIONS = {"excite"}  # tests/harness/test_identification.py moves an arm by it
 LAWS = {
@@ -93,33 +90,69 @@ def test_a_law_of_ones_own_keeps_up_with_a_method_of_the_bench_only_with_the_aid
     assert alone > 10.0 * own
 
 
-def test_a_learned_policy_is_the_network_that_was_written(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(FOLDER / "learned_policy.py", tmp_path)
-    env, rng = ServoEnv(task="exp2"), np.random.default_rng(0)
-    seen, _ = env.reset(seed=2)
-    sizes = (len(seen), 5, 4, 6)
-    layers = [(rng.normal(0.0, 0.3, (m, n)), rng.normal(0.0, 0.1, m)) for n, m in pairwise(sizes)]
-    np.savez("policy.npz", *(part.astype(np.float32) for layer in layers for part in layer))
-    steps = servobench.run("./learned_policy.py", task="exp2", seed=2).steps
-    (w1, b1), (w2, b2), (w3, b3) = [
-        tuple(part.astype(np.float32).astype(float) for part in each) for each in layers
-    ]
-    for feature in steps.filter(regex="^feature_.*_m$").to_numpy()[:40]:
-        np.testing.assert_allclose(env.observation.feature, feature, rtol=1e-12)
-        seen, *_ = env.step(w3 @ np.tanh(w2 @ np.tanh(w1 @ seen + b1) + b2) + b3)
+@pytest.fixture
+def training():
+    """Return the names of the training, with few robots and steps."""
+    names = runpy.run_path(str(FOLDER / "train_policy.py"))
+    names["train"].__globals__.update(LANES=16, STEPS=80, BATCH=128)
+    return names
+
+
+@pytest.mark.slow
+def test_a_policy_learns_and_acts_from_its_file_as_in_its_training(training, tmp_path):
+    """The written file, in a run of the harness, gives the actions of the network in numpy; its memory is in use."""
+    network = training["train"](3, 0)
+    path = tmp_path / "policy.onnx"
+    training["write"](network, path)
+    settings = {"random": {"duration": 1.5}}
+    made = servobench.run(str(path), task="random", plant="kinematic", seed=4, settings=settings)
+    commands = made.steps.filter(regex="^joint_velocity_command_").to_numpy()
+    env = ServoEnv(settings=settings)
+    seen, _ = env.reset(seed=4)
+    memory = np.zeros((1, network.layout.memory), np.float32)
+    for command in commands:
+        x, memory = network.remember(seen[None], memory)
+        action = np.clip(network.act(x)[0], -1.0, 1.0)
+        np.testing.assert_allclose(action, command, atol=1e-5)
+        seen, *_ = env.step(command)
     env.close()
+    assert len(commands) == 30
+    inputs, answers = training["episode"](ServoVectorEnv(16), network, 77, 1.0)
+    untrained = training["Network"](network.layout, 0)
+    losses = [each.learn(inputs, answers, 0.0) for each in (network, untrained)]
+    assert losses[0] < 0.6 * losses[1]
 
 
-def test_a_policy_is_trained_and_written(tmp_path, monkeypatch, capsys):
-    pytest.importorskip(
-        "stable_baselines3", reason="Stable-Baselines3 is not installed, and no requirement"
-    )
-    monkeypatch.setattr(
-        sys, "argv", ["train_policy.py", "--steps", "1", "--out", str(tmp_path / "policy.npz")]
-    )
-    runpy.run_path(str(FOLDER / "train_policy.py"), run_name="__main__")
-    assert "policy.npz: trained for 1 steps" in capsys.readouterr().out
-    with np.load(tmp_path / "policy.npz") as kept:
-        shapes = [kept[name].shape for name in kept.files]
-    assert [shape[0] for shape in shapes] == [64, 64, 64, 64, 6, 6]
+def test_a_step_of_the_training_goes_down_the_slope_of_the_loss(training):
+    """Against differences of the loss: the first step of Adam is the rate against the sign of each slope."""
+    rng = np.random.default_rng(0)
+    network = training["Network"](training["Layout"](6, 3, 51), 0)
+    network.parameters = [each.astype(float) for each in network.parameters]
+    inputs = rng.normal(size=(8, len(network.mean)))
+    answers = rng.normal(size=(8, 6))
+    before = [each.copy() for each in network.parameters]
+    network.learn(inputs, answers, 1e-3)
+    for k, parameter in enumerate(before):
+        place = (0,) * parameter.ndim
+        found = []
+        for change in (1e-6, -1e-6):
+            other = training["Network"](network.layout, 0)
+            other.parameters = [each.copy() for each in before]
+            other.parameters[k][place] += change
+            found.append(other.learn(inputs, answers, 0.0))
+        went = network.parameters[k][place] - parameter[place]
+        assert np.sign(went) == -np.sign(found[0] - found[1])
+        assert abs(went) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_teacher_of_the_training_brings_every_robot_to_its_target(training):
+    envs = ServoVectorEnv(16, settings={"random": {"duration": 4.0}})
+    seen, _ = envs.reset(seed=6)
+    teacher = training["Teacher"](16, 6)
+    target = envs.observation.feature + seen[:, 9:12]
+    for _ in range(79):
+        action = np.clip(teacher.wanted(envs.truth, target), -1.0, 1.0)
+        teacher.follow(action)
+        *_, info = envs.step(action)
+    envs.close()
+    assert (info["error"] < 1e-4).all()

@@ -93,6 +93,7 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
             ("record", "--plant", "kinematic", "--set", "circle.laps=1"),
             marks=NEEDS_BULLET,
         ),
+        ("onnxruntime", "onnx", ("run", "--plant", "kinematic", "--controller", "x.onnx")),
         ("pybullet", "bullet", ("run", "--plant", "bullet")),
         ("mujoco", "mujoco", ("run", "--plant", "mujoco")),
     ],

@@ -32,7 +32,7 @@ HOUR = ("five_minutes", "own_controller", "own_robot", "own_sensing", "fmu", "le
 SITE = sorted({*SESSIONS, *HOUR}, key=ORDER.index)
 LEFT_OUT = {  # words of a block -> why it is not carried out
     "--platforms all": "needs the compilers of the extra cross",
-    "train_policy.py": "trains for two minutes with a library that servobench does not need",
+    "train_policy.py": "trains for minutes; test_examples.py trains in small",
     "tune --controllers": "tunes for half an hour; test_own_tuning.py tunes in small",
     "mine.toml --plants": "needs the FMU of a controller; test_fmu_controller.py closes loops with some",
 }
