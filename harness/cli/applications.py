@@ -45,6 +45,7 @@ APPLICATIONS: Final = {
     "films": Application("films and snapshots of runs", ("record",), "animation"),
     "report": Application("a page about a results folder", ("report",), "report"),
     "loops": Application("loops at rest: margins and limits", ("analyse",)),
+    "play": Application("a page on which runs are steered while they go on", ("play",), "play"),
 }
 CORE: Final = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),
@@ -52,7 +53,7 @@ CORE: Final = {  # module of harness/cli -> its commands
     "lists": ("plants", "controllers", "tasks", "sensing", "init"),
 }
 PANELS: Final = {  # title on the help page -> commands, in the order of first use
-    "First steps": ("run", "compare", "statistics", "report", "figures", "record"),
+    "First steps": ("run", "compare", "statistics", "report", "figures", "record", "play"),
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
     "Studies": ("sweep", "analyse", "robustness", "suite", "claims", "tune"),

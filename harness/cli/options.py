@@ -165,6 +165,7 @@ NO_CAMERA = {
     "analyse": "its loops are those of the ball in 3-D before the bench's camera; compare shows how a method does"
 }
 NO_SENSING = {
+    "play": "its page shows the ball in space; figures of run --sensing show pixels",
     "record": "films show the ball's way through space; figures of run --sensing show pixels",
     "controllers": "settings of a controller are the same under all sensing",
 }

@@ -22,6 +22,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "mcap": "mcap",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
+    "viser": "play",
 }
 NO_WHEELS: Final = (3, 12)  # first version of Python for which PyBullet 3.2 offers none
 

@@ -63,6 +63,7 @@ class Rollout:
     settings: LoopSettings  # length of the run and the reasons to end it early
     k: int = 0  # periods that were begun
     _lost: Any = field(default=0, init=False)  # periods without a valid feature up to now, (...)
+    _first: int = field(default=0, init=False)  # the period of the first row of `desired`
 
     @property
     def running(self) -> bool:
@@ -72,7 +73,8 @@ class Rollout:
     @property
     def reference(self) -> FloatArray:
         """The reference from now on, (..., 1 + preview, m); a jump is not seen before it comes."""
-        rows = self.desired[..., self.k : self.k + 1 + self.settings.preview, :]
+        now = self.k - self._first
+        rows = self.desired[..., now : now + 1 + self.settings.preview, :]
         for jump in self.settings.jumps:
             ahead = jump - self.k
             if 0 < ahead <= self.settings.preview:
@@ -80,6 +82,11 @@ class Rollout:
                 hidden = np.broadcast_to(held, rows[..., ahead:, :].shape)
                 return np.concatenate([rows[..., :ahead, :], hidden], axis=-2)
         return rows
+
+    def redirect(self, desired: FloatArray) -> None:
+        """Follow other desired features, (..., at least 1 + preview, m), from the present instant on."""
+        self.desired = desired
+        self._first = self.k
 
     def advance(self, command: Command) -> None:
         """Hold a command for a period.

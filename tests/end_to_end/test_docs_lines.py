@@ -26,6 +26,7 @@ QUICK = ("plants", "controllers", "tasks", "sensing", "init", "new", "check")  #
 ONLY_READ = {
     "fmu": "compiles a model, which test_robot_commands.py does",
     "record": "renders a film, which test_record.py does",
+    "play": "serves until it is ended; tests/apps/play opens its page",
     "serve": "serves until it is ended; tests/harness/test_serve.py talks to it",
     "train": "trains networks, which the tests of controllers do",
     "tune": "takes hours; test_tune_command.py makes a few trials",

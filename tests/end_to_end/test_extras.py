@@ -82,6 +82,7 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
     [
         ("jinja2", "report", ("report", "made")),
         ("optuna", "tune", ("tune", "--trials", "1")),
+        ("viser", "play", ("play",)),
         (
             "distributed",
             "cluster",

@@ -1,0 +1,1 @@
+"""A page on which runs are steered while they go on."""
