@@ -19,6 +19,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "distributed": "cluster",
     "gymnasium": "gym",
     "mcap": "mcap",
+    "rosbags": "bag",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
 }

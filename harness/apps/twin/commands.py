@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import os
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import typer
 
@@ -21,27 +21,57 @@ from servobench.plant.contract.files import accessing, user_path, write_atomical
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from servobench.harness.apps.twin.joining import Joined
     from servobench.harness.run.resolution import ResolvedRun
 
 IDENTIFYING: Final = "constant"  # a controller, which identification does not run
 PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that is easier to write
 LOG = typer.Argument(
-    help="Results folder, or a table (.csv, .parquet) with the columns of its steps."
+    help="Results folder, or a table (.csv, .parquet) with the columns of its steps; none with --joints."
 )
+STREAM: Final = "table (.csv, .parquet) or bag (.mcap, folder of rosbag2, .db3, .bag; extra bag)"
 LEGEND: Final = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
     "The log does not answer to the controller, so that this does not say how well it would have done."
 )
 
 
+@dataclass(frozen=True)
+class StreamOptions:
+    """A log of two streams with stamps of their own."""
+
+    joints: Annotated[
+        Path | None, option("FILE", f"Joints in place of a log, at their own stamps: {STREAM}.")
+    ] = None
+    features: Annotated[
+        Path | None, option("FILE", "Features at theirs, likewise; default: the file of joints.")
+    ] = None
+    columns: Annotated[
+        Path | None, option("FILE", "TOML file with topics, fields, columns, joints and units.")
+    ] = None
+
+
+class _Logged(NamedTuple):
+    """A log with the run that it is taken for."""
+
+    name: str  # its file, in messages
+    resolved: ResolvedRun
+    table: DataFrame  # rows with the columns of steps
+    joined: Joined | None  # its two streams; None for one table
+
+
+USUAL_STREAMS: Final = StreamOptions()
+
+
 def shadow(
-    log: Annotated[Path, LOG],
+    log: Annotated[Path | None, LOG] = None,
     controller: Annotated[
         str | None, option(CONTROLLER, "Name or file of the controller; default: that of the run.")
     ] = None,
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
+    streams: StreamOptions = USUAL_STREAMS,
     out: Annotated[
         Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")
     ] = None,
@@ -56,11 +86,14 @@ def shadow(
     from servobench.harness.config.registry import find_controller
 
     chosen = None if controller is None else selection.choose("controllers", controller)
-    if chosen is not None and find_controller(chosen).needs_truth and not log.is_dir():
+    is_folder = log is not None and log.is_dir()
+    if chosen is not None and find_controller(chosen).needs_truth and not is_folder:
         raise ConfigurationError(
-            f"controller {chosen} is given the true robot, which {log} does not have"
+            f"controller {chosen} is given the true robot, which {log or 'a bag'} does not have"
         )
-    resolved, table = _logged(log, run, chosen, (robot, sensing), out)
+    logged = _logged(log, run, chosen, (robot, sensing), out, streams)
+    resolved = logged.resolved
+    table = logged.table
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     name, apart, ahead = resolved.request.controller, differences(seen), predictions(seen)
@@ -70,7 +103,7 @@ def shadow(
         say(f"table in {out}")
     elif apart.empty and ahead.empty:
         raise ConfigurationError(
-            f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller"
+            f"{logged.name} has no commands to compare with; --out FILE.csv keeps those of the controller"
         )
     if ahead.empty:
         say(f"{name} gives no Jacobian that could predict a feature")
@@ -86,10 +119,11 @@ def shadow(
 
 
 def identify(
-    log: Annotated[Path, LOG],
+    log: Annotated[Path | None, LOG] = None,
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
+    streams: StreamOptions = USUAL_STREAMS,
     out: Annotated[
         Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")
     ] = None,
@@ -99,7 +133,7 @@ def identify(
     A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
     """
     from servobench.harness.apps.twin.drive import command_response
-    from servobench.harness.apps.twin.identification import read_log
+    from servobench.harness.apps.twin.identification import check_frames, read_log
     from servobench.harness.apps.twin.preflight import mistakes
     from servobench.harness.apps.twin.summary import estimates, remarks
     from servobench.harness.apps.twin.twin_file import twin_text
@@ -110,10 +144,11 @@ def identify(
     from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
 
     try:
-        resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
+        logged = _logged(log, run, IDENTIFYING, (robot, sensing), out, streams)
     except UnevenRows as error:
         say(str(error))
         sys.exit(FAILED)
+    name, resolved, table, joined = logged
     request = resolved.request
     setup, own = find_sensing(request.sensing), find_robot(request.robot)
     if own.twin:
@@ -122,13 +157,15 @@ def identify(
             f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}"
         )
     if (
-        not log.is_dir()
+        log is None or not log.is_dir()
     ):  # a table does not say at which speed commands are clipped: at that of the robot
         resolved = replace(
             resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
         )
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)
+    if joined is not None:
+        rows = check_frames(rows._replace(valid=rows.valid & joined.known, clocks=joined.clocks))
     experiment.plant.close()
     apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
@@ -137,10 +174,10 @@ def identify(
         )
         response = command_response(rows)
     if found is None:
-        say(f"{log}: {mistake}")
+        say(f"{name}: {mistake}")
         sys.exit(FAILED)
     print_tables(
-        [(f"{log} against the nominal {own.title}, where they differ", estimates(found, response))]
+        [(f"{name} against the nominal {own.title}, where they differ", estimates(found, response))]
     )
     say("\n".join(remarks(rows, found, response)))
     if out is not None:
@@ -170,9 +207,42 @@ def _as_clock(period: float) -> str:
 
 
 def _logged(
+    log: Path | None,
+    run: str | None,
+    controller: str | None,
+    named: tuple[str, str],
+    out: Path | None,
+    streams: StreamOptions,
+) -> _Logged:
+    """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
+    if streams == USUAL_STREAMS:
+        if log is None:
+            raise ConfigurationError("missing argument 'LOG', or --joints with a file of joints")
+        return _Logged(str(log), *_logged_rows(log, run, controller, named, out), None)
+    if log is not None or streams.joints is None:
+        raise ConfigurationError(
+            "wanted either a log, or --joints with --features and --columns as need be"
+        )
+    features = streams.features or streams.joints
+    read = (streams.joints, features, streams.columns)
+    if out is not None and out.exists() and any(out.samefile(each) for each in read if each):
+        raise ConfigurationError(f"--out {out} is read itself; name another file")
+    if run is not None:
+        raise ConfigurationError("--run names a run of a results folder, and --joints a file")
+    if controller is None:
+        raise ConfigurationError(
+            f"{features} does not say which controller to show it to; name one with --controller"
+        )
+    from servobench.harness.apps.twin.joining import joined, run_of_rows
+
+    whole = joined(streams.joints, features, streams.columns, named)
+    return _Logged(str(features), run_of_rows(whole.period, controller, named), whole.table, whole)
+
+
+def _logged_rows(
     log: Path, run: str | None, controller: str | None, named: tuple[str, str], out: Path | None
 ) -> tuple[ResolvedRun, DataFrame]:
-    """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
+    """Return the run of a results folder or table, and its rows; see `_logged`."""
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.batch.results import ResultsFolder
 

@@ -42,7 +42,14 @@ JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s] that are tried
 
 
 def frame_period(log: Log) -> float:
-    """Return the distance of frames of which some may be missing [s]: usual gaps, and those a row longer or shorter."""
+    """Return the distance of frames of which some may be missing [s]: usual gaps, and those a row longer or shorter.
+
+    Where clocks are given, it is that of the stamps.
+    """
+    if log.clocks:
+        stamps = log.captured[log.stamped]
+        gaps = np.diff(stamps)
+        return float(np.ptp(stamps) / np.rint(gaps / np.median(gaps)).sum())
     rows = np.flatnonzero(log.valid)
     gaps = np.diff(rows)
     counts = np.bincount(gaps, minlength=gaps.max() + 2)
@@ -70,6 +77,9 @@ def _is_steady(rows: npt.NDArray[np.intp], length: float, odd: int) -> bool:
 
 def missing_frames(log: Log) -> FloatArray:
     """Return how many frames are missing in each gap between two."""
+    if log.clocks:
+        stamps = log.captured[log.stamped]
+        return np.maximum(np.rint(np.diff(stamps) / frame_period(log)) - 1.0, 0.0)
     gaps = np.diff(np.flatnonzero(log.valid))
     length = frame_period(log) / log.spec.period  # [rows]
     longest = math.ceil(length - 1e-9)
@@ -108,6 +118,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     if log.stamped.any():
         sensing["stamps"] = True
         late = log.lateness[log.stamped]
+        late = late - late.mean()
         wave = fitted_wave(log.frame_time[log.stamped], late, np.ones_like(late))
         if wave is not None and wave[-1] < WAVE_RESIDUAL_SHARE:
             pace, sizes, _ = wave
@@ -138,7 +149,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
         noise = lateness.noise
         outliers = ~lateness.kept
         lost = max(0.0, lost - waiting.missing)
-    else:
+    elif log.clocks is None:
         rows = frame_period(log) / period
         if abs(rows - round(rows)) > MIN_ROW_PART:
             wait = 0.5 * period  # until the next control instant

@@ -57,7 +57,7 @@ def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
 
 def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]:
     """Return lines on a log: its noise, its unexplained residuals, and the parameters that it leaves open."""
-    lines = [_noise_line(log, robot), _residuals_line(log, robot)]
+    lines = [_noise_line(log, robot), _residuals_line(log, robot), *_clock_lines(log, robot)]
     motions = zip(log.spec.joint_names, np.ptp(log.joints, axis=0), strict=True)
     still = [name for name, motion in motions if motion < MIN_MOTION]
     if still:
@@ -88,6 +88,21 @@ def _noise_line(log: Log, robot: Identified) -> str:
     return (
         f"residuals [{unit}]: {noise}; outliers {outliers:.1%}, lost frames {lost_share(log):.1%}"
     )
+
+
+def _clock_lines(log: Log, robot: Identified) -> list[str]:
+    """Return what the latency of a log with stamps of its own holds, and the offset of its clocks where it is told."""
+    if log.clocks is None:
+        return []
+    delivery = log.clocks.delivery
+    if delivery is None:
+        told = "latency is from exposure to stamp, with the offset of the camera's clock from that of the joints"
+        return [f"{told}; one bag with times of recording tells them apart"]
+    latency, deviation = robot.estimate("latency")
+    ahead = 1e3 * (latency - delivery)
+    told = "latency is from exposure to recording, by one clock"
+    offset = f"by stamps the camera's clock is {ahead:+.1f} ± {1960.0 * deviation:.1g} ms ahead of that of the joints"
+    return [f"{told}; {offset}, if frames are stamped when they are exposed"]
 
 
 def _residuals_line(log: Log, robot: Identified) -> str:
