@@ -22,10 +22,12 @@ from scipy.interpolate import CubicSpline
 import servobench
 from measuring import options
 from servobench.harness.apps.twin.identification import read_log
-from servobench.harness.apps.twin.joining import joined, run_of_rows
+from servobench.harness.apps.twin.joining import joined
 from servobench.harness.config.sensing import find_sensing
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
 from servobench.harness.run.sampling import draw_robot
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec, column_names
@@ -207,8 +209,10 @@ def resampled(made: Recording, files: list[Path]) -> pd.DataFrame:
 
 
 def run_spec(made: Recording) -> PlantSpec:
-    """Return the spec of a log."""
-    experiment = build(run_of_rows(PERIOD, "constant", (made.robot, "position")))
+    """Return the spec of a log with rows at equal steps."""
+    request = RunRequest("kinematic", "constant", "circle", Mismatch(), 0, robot=made.robot)
+    settings = {"run": {"period": PERIOD}, "kinematic": {"command_delay": 0.0}}
+    experiment = build(resolve(request, Settings(settings)))
     experiment.plant.close()
     return experiment.plant.spec
 
@@ -228,34 +232,33 @@ def main() -> None:
             if given.kind == "csv":
                 files = write_tables(made, Path(name), draws)
                 told["latency"] += OFFSET
-                table = resampled(made, files)
-                own = read_log(run_spec(made), table)
+                own = read_log(run_spec(made), resampled(made, files))
                 by_hand += judged(own, nominal, made.true, told, dict(about))
             else:
                 files = write_bag(made, Path(name), draws, given.kind, given.image)
                 size = sum(each.stat().st_size for each in files[0].parent.rglob("*.*"))
                 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
                 began = time.perf_counter()
-            whole = joined(
-                files[0], files[1], files[2] if len(files) > 2 else None, (made.robot, "position")
-            )
+            columns = files[2] if len(files) > 2 else None
+            chosen = (made.robot, "position")
+            read = joined((files[0], files[1], columns), chosen, "constant")
+            resolved, table, clocks = read
             if given.image:
                 taken = time.perf_counter() - began
                 grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
                 print(
                     f"bag of {size / 1e6:.0f} MB: {taken:.1f} s, memory grows by {grown / 1e3:.0f} MB"
                 )
-        experiment = build(run_of_rows(whole.period, "constant", (made.robot, "position")))
+        experiment = build(resolved)
         experiment.plant.close()
-        log = read_log(experiment.plant.spec, whole.table)
-        log = log._replace(valid=log.valid & whole.known, clocks=whole.clocks)
+        log = read_log(experiment.plant.spec, table, clocks=clocks)
         found = judged(log, nominal, made.true, told, dict(about))
-        if whole.clocks.delivery is not None:
+        if clocks.delivery is not None:
             error = [
                 row["error"] + told["latency"] for row in found if row["parameter"] == "latency"
             ]
             for row in found:
-                row["offset"] = error[0] - whole.clocks.delivery - OFFSET if error else np.nan
+                row["offset"] = error[0] - clocks.delivery - OFFSET if error else np.nan
         rows += found
     print_summary(pd.DataFrame(rows))
     if given.kind != "csv":

@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -21,7 +21,7 @@ from servobench.plant.contract.files import accessing, user_path, write_atomical
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from servobench.harness.apps.twin.joining import Joined
+    from servobench.harness.apps.twin.identification import Clocks
     from servobench.harness.run.resolution import ResolvedRun
 
 IDENTIFYING: Final = "constant"  # a controller, which identification does not run
@@ -29,7 +29,7 @@ PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that i
 LOG = typer.Argument(
     help="Results folder, or a table (.csv, .parquet) with the columns of its steps; none with --joints."
 )
-STREAM: Final = "table (.csv, .parquet) or bag (.mcap, folder of rosbag2, .db3, .bag; extra bag)"
+STREAM: Final = "table (.csv, .parquet) or bag (.mcap, rosbag2, .db3, .bag; extra bag)"
 LEGEND: Final = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
     "The log does not answer to the controller, so that this does not say how well it would have done."
@@ -49,15 +49,6 @@ class StreamOptions:
     columns: Annotated[
         Path | None, option("FILE", "TOML file with topics, fields, columns, joints and units.")
     ] = None
-
-
-class _Logged(NamedTuple):
-    """A log with the run that it is taken for."""
-
-    name: str  # its file, in messages
-    resolved: ResolvedRun
-    table: DataFrame  # rows with the columns of steps
-    joined: Joined | None  # its two streams; None for one table
 
 
 USUAL_STREAMS: Final = StreamOptions()
@@ -91,9 +82,7 @@ def shadow(
         raise ConfigurationError(
             f"controller {chosen} is given the true robot, which {log or 'a bag'} does not have"
         )
-    logged = _logged(log, run, chosen, (robot, sensing), out, streams)
-    resolved = logged.resolved
-    table = logged.table
+    log_name, resolved, table, _ = _logged(log, run, chosen, (robot, sensing), out, streams)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     name, apart, ahead = resolved.request.controller, differences(seen), predictions(seen)
@@ -103,7 +92,7 @@ def shadow(
         say(f"table in {out}")
     elif apart.empty and ahead.empty:
         raise ConfigurationError(
-            f"{logged.name} has no commands to compare with; --out FILE.csv keeps those of the controller"
+            f"{log_name} has no commands to compare with; --out FILE.csv keeps those of the controller"
         )
     if ahead.empty:
         say(f"{name} gives no Jacobian that could predict a feature")
@@ -133,7 +122,7 @@ def identify(
     A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
     """
     from servobench.harness.apps.twin.drive import command_response
-    from servobench.harness.apps.twin.identification import check_frames, read_log
+    from servobench.harness.apps.twin.identification import read_log
     from servobench.harness.apps.twin.preflight import mistakes
     from servobench.harness.apps.twin.summary import estimates, remarks
     from servobench.harness.apps.twin.twin_file import twin_text
@@ -144,11 +133,12 @@ def identify(
     from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
 
     try:
-        logged = _logged(log, run, IDENTIFYING, (robot, sensing), out, streams)
+        name, resolved, table, clocks = _logged(
+            log, run, IDENTIFYING, (robot, sensing), out, streams
+        )
     except UnevenRows as error:
         say(str(error))
         sys.exit(FAILED)
-    name, resolved, table, joined = logged
     request = resolved.request
     setup, own = find_sensing(request.sensing), find_robot(request.robot)
     if own.twin:
@@ -163,9 +153,7 @@ def identify(
             resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
         )
     experiment = build(resolved)
-    rows = read_log(experiment.plant.spec, table)
-    if joined is not None:
-        rows = check_frames(rows._replace(valid=rows.valid & joined.known, clocks=joined.clocks))
+    rows = read_log(experiment.plant.spec, table, clocks=clocks)
     experiment.plant.close()
     apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
@@ -213,39 +201,27 @@ def _logged(
     named: tuple[str, str],
     out: Path | None,
     streams: StreamOptions,
-) -> _Logged:
-    """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
-    if streams == USUAL_STREAMS:
-        if log is None:
-            raise ConfigurationError("missing argument 'LOG', or --joints with a file of joints")
-        return _Logged(str(log), *_logged_rows(log, run, controller, named, out), None)
-    if log is not None or streams.joints is None:
-        raise ConfigurationError(
-            "wanted either a log, or --joints with --features and --columns as need be"
-        )
-    features = streams.features or streams.joints
-    read = (streams.joints, features, streams.columns)
-    if out is not None and out.exists() and any(out.samefile(each) for each in read if each):
-        raise ConfigurationError(f"--out {out} is read itself; name another file")
-    if run is not None:
-        raise ConfigurationError("--run names a run of a results folder, and --joints a file")
-    if controller is None:
-        raise ConfigurationError(
-            f"{features} does not say which controller to show it to; name one with --controller"
-        )
-    from servobench.harness.apps.twin.joining import joined, run_of_rows
+) -> tuple[str, ResolvedRun, DataFrame, Clocks | None]:
+    """Return the name of a log, the run that it is taken for, its rows, and the clocks of its streams, if any.
 
-    whole = joined(streams.joints, features, streams.columns, named)
-    return _Logged(str(features), run_of_rows(whole.period, controller, named), whole.table, whole)
-
-
-def _logged_rows(
-    log: Path, run: str | None, controller: str | None, named: tuple[str, str], out: Path | None
-) -> tuple[ResolvedRun, DataFrame]:
-    """Return the run of a results folder or table, and its rows; see `_logged`."""
+    The run is that of a controller, None for that of the log, with robot and sensing as named.
+    """
+    from servobench.harness.apps.twin.joining import joined
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.batch.results import ResultsFolder
 
+    if streams.joints is not None:
+        features = streams.features or streams.joints
+        if log or run or not controller:
+            raise ConfigurationError(
+                "--joints is in place of a log and --run, and wants a --controller"
+            )
+        if out and out in (streams.joints, features, streams.columns):
+            raise ConfigurationError(f"--out {out} is the log itself; name another file")
+        read = joined((streams.joints, features, streams.columns), named, controller)
+        return str(features), *read
+    if not log or streams != USUAL_STREAMS:
+        raise ConfigurationError("missing argument 'LOG', or --joints with a file of joints")
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
     if out is not None and out.exists() and out.samefile(log):
@@ -257,11 +233,11 @@ def _logged_rows(
                 raise ConfigurationError(
                     f"--{word} {given} is not that of the run, {own}; leave it out for a folder"
                 )
-        return resolved, table
+        return str(log), resolved, table, None
     if run is not None:
         raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
     if controller is None:
         raise ConfigurationError(
             f"{log} does not say which controller to show it to; name one with --controller"
         )
-    return logged_in_file(log, controller, *named)
+    return str(log), *logged_in_file(log, controller, *named), None

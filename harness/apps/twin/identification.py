@@ -232,7 +232,9 @@ def _repeated(features: FloatArray) -> BoolArray:
     return np.asarray((~changed | placeholder) & beside_large[runs])
 
 
-def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:
+def read_log(
+    spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES, clocks: Clocks | None = None
+) -> Log:
     """Return the rows of a table with columns as `steps.parquet` has them, `spec.period` apart.
 
     Raises:
@@ -259,13 +261,8 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     elif any(str(name).startswith(VELOCITY) for name in table):
         missing = ", ".join(lacking)
         remark(f"the log has columns {VELOCITY}_… but no {missing}: commands are left out")
-    log = Log(spec, time, joints, features, valid, commands, _stamps(table))
+    log = Log(spec, time, joints, features, valid, commands, _stamps(table), clocks)
     _check_clock(log)
-    return check_frames(log, least)
-
-
-def check_frames(log: Log, least: int = MIN_FRAMES) -> Log:
-    """Return a log; refuse one with fewer than `least` valid frames."""
     count = len(frames_of(log))
     if count < least:
         after = f"after the first {MAX_LATENCY:g} s"

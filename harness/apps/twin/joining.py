@@ -1,31 +1,22 @@
 """A log of streams with stamps of their own: rows of a controller, and frames at their stamps by the joints' clock.
 
-Rows are the samples of the joints. Where their stamps jitter about the ticks of an even clock, and the motion is
-smoother by this clock than by the stamps, they are taken at its ticks. A frame stands in the row in which it arrived,
-and keeps its stamp, which the fit takes as it is. Where one clock has recorded both streams, the delay between a stamp
-and its recording is known for both, so that latency and offset of the clocks are told apart:
-
-    latency = exposure → recording of a frame, relative to that of joints;  offset = delivery − latency
+Rows are as far apart as the stamps of the faster stream. A frame stands in the row in which it arrived, and keeps its
+stamp, which the fit takes as it is; it counts if joints are logged at every latency that is sought. Commands and
+references of a row are those that hold in its middle. Where one clock has recorded both streams, the time from a stamp
+to its recording is known for both, so that latency and offset of the clocks are told apart: the latency is then from
+exposure to recording, relative to that of joints, and the offset is the latency behind stamps.
 """
 
 import math
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import pandas as pd
 from scipy.interpolate import PchipInterpolator
 
 from servobench.harness.apps.twin.identification import CAPTURED, MAX_LATENCY, Clocks
-from servobench.harness.apps.twin.streams import (
-    COMMANDS,
-    FEATURES,
-    JOINTS,
-    REFERENCE,
-    Stream,
-    read_map,
-    read_stream,
-)
+from servobench.harness.apps.twin.streams import USUAL, Stream, StreamMap, read_map, read_stream
 from servobench.harness.batch.logs import PLANT, TASK
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings
@@ -34,53 +25,25 @@ from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import TIME
-from servobench.plant.contract.signals import BoolArray, column_names
+from servobench.plant.contract.signals import column_names
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch
 
 MAX_OFFSET: Final = 1.0  # [s] between clocks, with the latency, within which it is sought
-# Joints are not known in a gap longer than this, nor than some samples.
-MAX_GAP: Final = 0.1  # [s]
-MAX_LOST_SAMPLES: Final = 3.0
-FIRST_SAMPLES: Final = 1024  # by which the period of a clock is found
-PERIODS: Final = np.linspace(0.9, 1.1, 4001)  # [1] tried periods over the median distance of stamps
-# Frames are faster than joints if they are nearer to each other than this share of the joints' period.
-FASTER_RATIO: Final = 0.95  # [1]
 ROUNDING: Final = 1e-3  # [rows] by which a frame may come after its row
 
 
-class Joined(NamedTuple):
-    """Rows of a log, as of a table with the columns of steps."""
-
-    table: pd.DataFrame
-    period: float  # [s]
-    clocks: Clocks
-    known: BoolArray  # rows with a frame that shows joints within the log at every latency that is sought, (k,)
-
-
-class _Rows(NamedTuple):
-    """The instants of rows, with the joints there."""
-
-    begin: float  # [s] the first instant by the joints' clock
-    period: float  # [s]
-    joints: FloatArray  # (k, n) [rad]
-    gaps: FloatArray  # (g, 2) [s] begin and end of gaps between samples by the joints' clock
-
-    @property
-    def edges(self) -> FloatArray:
-        """Instants of the rows and the end of the last one by the joints' clock, (k + 1,) [s]."""
-        return np.asarray(self.begin + self.period * np.arange(len(self.joints) + 1))
-
-
-def joined(joints: Path, features: Path, columns: Path | None, named: tuple[str, str]) -> Joined:
-    """Return the log of two files.
+def joined(
+    files: tuple[Path, Path, Path | None], named: tuple[str, str], controller: str
+) -> tuple[ResolvedRun, pd.DataFrame, Clocks]:
+    """Return the log of two files: the run that it is taken for, rows with the columns of steps, and its clocks.
 
     Args:
-        joints: table or bag with joint positions, and commands if it has any.
-        features: table or bag with features, and references if it has any.
-        columns: map of the columns or topics; None for the usual ones.
+        files: table or bag with joints, and commands if it has any; the same with features, and references if it has
+            any; map of the columns, None for the usual ones.
         named: robot and sensing.
+        controller: that is to see the log.
 
     Raises:
         ConfigurationError: a stream cannot be read, or no frame is within the time of the joints.
@@ -88,150 +51,74 @@ def joined(joints: Path, features: Path, columns: Path | None, named: tuple[str,
     """
     robot, sensing = named
     model = find_sensing(sensing).nominal(find_robot(robot))
-    spec = hand_eye_spec(model, period=1.0, max_joint_speed=1.0, joint_range=1.0)
+    spec = hand_eye_spec(model, 1.0, 1.0, 1.0)
+    joints, features, columns = files
     keys = read_map(columns)
-    moved = read_stream(joints, JOINTS, keys.joints, spec)
-    seen = read_stream(features, FEATURES, keys.features, spec)
-    same_clock = joints.samefile(features) or bool(keys.joints.received and keys.features.received)
-    is_recorded = np.isfinite(moved.received).all() and np.isfinite(seen.received).all()
-    if same_clock and is_recorded:
-        delay = _delay(moved)
-        clocks = Clocks(0.0, MAX_LATENCY, _delay(seen) - delay)
+    moved = read_stream(joints, "joints", keys.joints, spec)
+    seen = read_stream(features, "features", keys.features, spec)
+    clocks = Clocks(-MAX_OFFSET, MAX_OFFSET, None)
+    captured = seen.time
+    arrived = seen.time
+    delay = _delay(moved)
+    delivery = _delay(seen) - delay
+    if joints.samefile(features) and math.isfinite(delivery):
+        clocks = Clocks(0.0, MAX_LATENCY, delivery)
+        captured = seen.time + delivery
         arrived = seen.received - delay
-        captured = seen.time + _delay(seen) - delay
-    else:
-        clocks = Clocks(-MAX_OFFSET, MAX_OFFSET, None)
-        arrived = seen.time
-        captured = seen.time
-    rows = _rows(moved, float(np.median(np.diff(captured))))
-    end = rows.edges[-1]
-    if not ((captured >= rows.begin) & (captured <= end)).any():
-        span = f"from {captured[0]:.3f} to {captured[-1]:.3f} s, joints from {rows.begin:.3f} to {end:.3f} s"
-        remedy = "if their clocks are apart, write offset = … (in s, added to stamps) in [features] of the map"
-        raise ConfigurationError(
-            f"{features} and {joints} do not overlap: features run {span}; {remedy}"
-        )
+    begin, *_, end = moved.time.tolist()
+    period = min(_period(moved.time), _period(captured))
+    time = np.arange(begin, end, period)
     names = column_names(spec)
-    table = pd.DataFrame(rows.joints, columns=names["joint_position"])
-    table.insert(0, TIME, rows.edges[:-1] - rows.begin)
-    frames = _in_rows(rows, arrived, np.column_stack([seen.values, captured]))
+    positions = PchipInterpolator(moved.time, moved.values)(time)
+    table = pd.DataFrame(positions, columns=names["joint_position"])
+    table.insert(0, TIME, time - begin)
+    frames = _in_rows(
+        (arrived - begin) / period, np.column_stack([seen.values, captured]), len(time)
+    )
     table[names["feature"]] = frames[:, :-1]
-    table["feature_valid"] = np.isfinite(frames[:, -1])
-    table[CAPTURED] = frames[:, -1] - rows.begin
-    commands = read_stream(joints, COMMANDS, keys.commands, spec)
-    if commands.time.size:
-        since = np.where(
-            np.isfinite(commands.received), commands.received - _delay(moved), commands.time
-        )
-        table[names[COMMANDS.column]] = _means(rows, since, commands.values)
-    reference = read_stream(features, REFERENCE, keys.reference, spec)
-    if reference.time.size:
-        newest = (
-            np.searchsorted(reference.time, rows.edges[:-1] + ROUNDING * rows.period, side="right")
-            - 1
-        )
-        table[names[REFERENCE.column]] = reference.values[np.maximum(newest, 0)]
-    return Joined(table, rows.period, clocks, _are_known(rows, frames[:, -1], clocks))
-
-
-def run_of_rows(period: float, controller: str, named: tuple[str, str]) -> ResolvedRun:
-    """Return the run of a controller with a period [s], on robot and sensing as `named`, for which a log is taken."""
-    robot, sensing = named
+    table[CAPTURED] = frames[:, -1] - begin
+    last = end - begin + clocks.lowest
+    table["feature_valid"] = table[CAPTURED].between(clocks.highest, last)
+    if not table["feature_valid"].any():
+        span = f"features run from {captured[0]:.3f} s on, joints from {begin:.3f} to {end:.3f} s"
+        remedy = "if clocks are apart, write offset = … (in s) in [features] of the map"
+        raise ConfigurationError(f"{features} and {joints} do not overlap: {span}; {remedy}")
+    further = (("commands", joints, keys.commands), ("reference", features, keys.reference))
+    for kind, path, own in further:
+        try:
+            stream = read_stream(path, kind, own, spec)
+        except ConfigurationError:
+            if own != StreamMap():
+                raise
+            continue
+        newest = np.searchsorted(stream.time, time + 0.5 * period) - 1
+        table[names[USUAL[kind][0]]] = stream.values[np.maximum(newest, 0)]
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
-    return resolve(request, Settings({"run": {"period": period}, PLANT: {"command_delay": 0.0}}))
+    settings = Settings({"run": {"period": period}, PLANT: {"command_delay": 0.0}})
+    return resolve(request, settings), table, clocks
+
+
+def _period(stamps: FloatArray) -> float:
+    """Return the distance of stamps (k,) of which some may be missing [s]."""
+    steps = np.diff(stamps)
+    return float(np.sum(steps) / np.rint(steps / np.median(steps)).sum())
 
 
 def _delay(stream: Stream) -> float:
     """Return how long after its stamp a sample is recorded [s]."""
-    return float(np.median(stream.received - stream.time))
+    return np.median(stream.received - stream.time).item()
 
 
-def _rows(moved: Stream, frame_period: float) -> _Rows:
-    """Return rows at the period of the joints, or at a part of it where frames come faster [s]."""
-    time = moved.time
-    period = float(np.median(np.diff(time)))
-    even = _even_clock(time)
-    if even is not None:
-        ticks, even_period = even
-        if _roughness(ticks, moved.values) <= _roughness(time, moved.values):
-            time = ticks
-            period = even_period
-    steps = np.diff(time)
-    lost = np.flatnonzero(steps > max(MAX_GAP, MAX_LOST_SAMPLES * period))
-    gaps = np.stack([time[lost], time[lost + 1]], axis=1)
-    period /= max(1, math.ceil(FASTER_RATIO * period / frame_period))
-    count = math.floor((time[-1] - time[0]) / period + ROUNDING) + 1
-    instants = np.minimum(time[0] + period * np.arange(count), time[-1])
-    joints = PchipInterpolator(time, moved.values)(instants)
-    return _Rows(float(time[0]), period, joints, gaps)
-
-
-def _even_clock(stamps: FloatArray) -> tuple[FloatArray, float] | None:
-    """Return the ticks of an even clock behind stamps (k,) and its period [s]; None if two stamps share a tick.
-
-    The period is that of the strongest line in the spectrum of the first stamps, Σ exp(2πi t/T), which jitter and
-    losses hardly move. It is then fitted to more and more samples, so that no number of a tick is in doubt.
-    """
-    since = stamps - stamps[0]
-    first = since[:FIRST_SAMPLES]
-    tried = float(np.median(np.diff(since))) * PERIODS
-    lines = np.exp(2j * np.pi * first / tried[:, None]).mean(axis=1)
-    strongest = int(np.abs(lines).argmax())
-    period = float(tried[strongest])
-    begin = float(np.angle(lines[strongest])) / (2.0 * np.pi) * period
-    size = min(FIRST_SAMPLES, len(since))
-    numbers = np.rint((since - begin) / period)
-    while np.ptp(numbers[:size]) > 0.0:
-        period, begin = np.polyfit(numbers[:size], since[:size], 1).tolist()
-        numbers = np.rint((since - begin) / period)
-        if size == len(since):
-            break
-        size = min(2 * size, len(since))
-    if (np.diff(numbers) < 1.0).any():
-        return None
-    return stamps[0] + begin + period * numbers, period
-
-
-def _roughness(time: FloatArray, values: FloatArray) -> float:
-    """Return how far every second sample is from the curve through the others, in the median [rad]."""
-    if len(time) < 5:
-        return 0.0
-    curve = PchipInterpolator(time[::2], values[::2])
-    inner = slice(1, 2 * ((len(time) - 1) // 2), 2)
-    return float(np.median(np.abs(curve(time[inner]) - values[inner]).max(axis=1)))
-
-
-def _in_rows(rows: _Rows, arrived: FloatArray, values: FloatArray) -> FloatArray:
-    """Return values (f, m) of frames in the rows at which they are there, NaN in others, (k, m).
+def _in_rows(rows: FloatArray, values: FloatArray, count: int) -> FloatArray:
+    """Return values (f, m) of frames that arrive at `rows` (f,) in the next whole row, NaN in others, (count, m).
 
     Where two frames arrive within a row, the second one stands in the next row: its stamp is what counts.
     """
-    place = np.ceil((arrived - rows.begin) / rows.period - ROUNDING)
-    inside = (place >= 0.0) & (place < len(rows.joints))
+    inside = (rows >= 0.0) & (rows < count)
     number = np.arange(int(inside.sum()))
-    place = np.maximum.accumulate(place[inside] - number) + number
-    fitting = place < len(rows.joints)
-    found = np.full((len(rows.joints), values.shape[1]), np.nan)
+    place = np.ceil(rows[inside] - ROUNDING)
+    place = np.maximum.accumulate(place - number) + number
+    fitting = place < count
+    found = np.full((count, values.shape[1]), np.nan)
     found[place[fitting].astype(int)] = values[inside][fitting]
     return found
-
-
-def _means(rows: _Rows, since: FloatArray, commands: FloatArray) -> FloatArray:
-    """Return the mean of commands (c, n), each of which is in force until the next, in each row, (k, n)."""
-    edges = rows.edges
-    ends = np.append(since[1:], max(edges[-1], since[-1]))
-    turned = np.cumsum((ends - since)[:, None] * commands, axis=0)
-    knots = np.append(since, ends[-1])
-    total = np.concatenate([np.zeros((1, commands.shape[1])), turned])
-    at_edges = np.stack([np.interp(edges, knots, each) for each in total.T], axis=1)
-    return np.asarray(np.diff(at_edges, axis=0) / rows.period)
-
-
-def _are_known(rows: _Rows, captured: FloatArray, clocks: Clocks) -> BoolArray:
-    """Return which frames show joints within the log, and in no gap, at every latency that is sought, (k,)."""
-    first = captured - clocks.highest
-    last = captured - clocks.lowest
-    known = (first >= rows.begin) & (last <= rows.edges[-1])
-    for begin, end in rows.gaps:
-        known &= (last < begin) | (first > end)
-    return np.asarray(known)

@@ -42,14 +42,7 @@ JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s] that are tried
 
 
 def frame_period(log: Log) -> float:
-    """Return the distance of frames of which some may be missing [s]: usual gaps, and those a row longer or shorter.
-
-    Where clocks are given, it is that of the stamps.
-    """
-    if log.clocks:
-        stamps = log.captured[log.stamped]
-        gaps = np.diff(stamps)
-        return float(np.ptp(stamps) / np.rint(gaps / np.median(gaps)).sum())
+    """Return the distance of frames of which some may be missing [s]: usual gaps, and those a row longer or shorter."""
     rows = np.flatnonzero(log.valid)
     gaps = np.diff(rows)
     counts = np.bincount(gaps, minlength=gaps.max() + 2)
@@ -77,9 +70,6 @@ def _is_steady(rows: npt.NDArray[np.intp], length: float, odd: int) -> bool:
 
 def missing_frames(log: Log) -> FloatArray:
     """Return how many frames are missing in each gap between two."""
-    if log.clocks:
-        stamps = log.captured[log.stamped]
-        return np.maximum(np.rint(np.diff(stamps) / frame_period(log)) - 1.0, 0.0)
     gaps = np.diff(np.flatnonzero(log.valid))
     length = frame_period(log) / log.spec.period  # [rows]
     longest = math.ceil(length - 1e-9)

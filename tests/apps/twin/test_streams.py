@@ -1,6 +1,6 @@
 """Logs of two streams with stamps of their own: tables and bags are read as they are, and no user resamples."""
 
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -8,20 +8,12 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from servobench.harness.apps.twin.identification import identify, read_log
-from servobench.harness.apps.twin.joining import (
-    COMMANDS,
-    _even_clock,
-    _in_rows,
-    _means,
-    _Rows,
-    joined,
-    run_of_rows,
-)
-from servobench.harness.apps.twin.streams import COMMANDS as COMMAND_KIND
+from servobench.harness.apps.twin.identification import Clocks, identify, read_log
+from servobench.harness.apps.twin.joining import _in_rows, joined
 from servobench.harness.apps.twin.summary import remarks
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.run.experiment import build
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.twin import deviated
@@ -118,11 +110,20 @@ def write_bag(folder, plugin=StoragePlugin.MCAP, seconds=40.0):
     return folder / "bag"
 
 
+class Read(NamedTuple):
+    resolved: ResolvedRun
+    table: pd.DataFrame
+    clocks: Clocks
+
+
+def read(*files):
+    return Read(*joined(files, (ROBOT, "position"), "constant"))
+
+
 def log_of(whole):
-    experiment = build(run_of_rows(whole.period, "constant", (ROBOT, "position")))
+    experiment = build(whole.resolved)
     experiment.plant.close()
-    log = read_log(experiment.plant.spec, whole.table)
-    return log._replace(valid=log.valid & whole.known, clocks=whole.clocks)
+    return read_log(experiment.plant.spec, whole.table, clocks=whole.clocks)
 
 
 def identified(whole):
@@ -139,39 +140,40 @@ def check(robot, name, true, largest):
 
 @pytest.mark.slow
 def test_two_tables_tell_the_sum_of_latency_and_offset(tmp_path):
-    whole = joined(*write_tables(tmp_path), (ROBOT, "position"))
-    assert whole.period == pytest.approx(PERIOD, abs=1e-6)
+    whole = read(*write_tables(tmp_path))
+    assert whole.resolved.run.period == pytest.approx(PERIOD, rel=2e-3)
     log, robot = identified(whole)
     check(robot, "latency", LATENCY + OFFSET, 0.002)
     check(robot, "zero_elbow", 0.03, 0.01)
     check(robot, "gear_shoulder_pan", 0.01, 0.01)
-    assert "with the offset of the camera's clock" in "\n".join(remarks(log, robot, None))
+    assert "latency holds the offset of the clocks" in "\n".join(remarks(log, robot, None))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plugin", StoragePlugin)
 def test_one_bag_tells_latency_and_offset_apart(tmp_path, plugin):
     bag = write_bag(tmp_path, plugin)
-    whole = joined(bag, bag, None, (ROBOT, "position"))
+    whole = read(bag, bag, None)
     log, robot = identified(whole)
     check(robot, "latency", LATENCY, 0.002)
     assert robot.estimate("latency")[0] - whole.clocks.delivery == pytest.approx(OFFSET, abs=0.004)
     words = "\n".join(remarks(log, robot, None))
-    assert "by one clock; by stamps the camera's clock is +3" in words
+    assert "when exposed: +3" in words
 
 
 def test_a_bare_mcap_file_has_what_its_folder_has(tmp_path):
     bag = write_bag(tmp_path, seconds=5.0)
     file = bag / "bag.mcap"
-    whole, same = (joined(each, each, None, (ROBOT, "position")) for each in (bag, file))
+    whole, same = (read(each, each, None) for each in (bag, file))
     pd.testing.assert_frame_equal(whole.table, same.table)
 
 
 def test_stamps_of_every_unit_and_format_are_the_same(tmp_path):
     joints, features, columns = write_tables(tmp_path, seconds=3.0)
-    wanted = joined(joints, features, columns, (ROBOT, "position")).table
+    wanted = read(joints, features, columns).table
     whole = pd.read_csv(joints)
     elapsed = whole["%time"] - START
+    features_of = ["capture_time_s", "feature_x_m"]
     kinds = {
         '"s"': elapsed / 1e9 + START // 10**9,
         '"ms"': elapsed / 1e6 + START // 10**6,
@@ -181,18 +183,10 @@ def test_stamps_of_every_unit_and_format_are_the_same(tmp_path):
     for unit, column in kinds.items():
         whole.assign(**{"%time": column}).to_parquet(tmp_path / "joints.parquet")
         columns.write_text(MAP.replace('"ns"', unit, 1))
-        table = joined(tmp_path / "joints.parquet", features, columns, (ROBOT, "position")).table
-        np.testing.assert_allclose(table.astype(float), wanted.astype(float), atol=1e-5)
-
-
-def test_an_even_clock_is_found_behind_jitter_losses_and_a_pause():
-    draws = np.random.default_rng(3)
-    numbers = np.flatnonzero(draws.random(9000) > 0.05)
-    numbers = numbers[(numbers < 2000) | (numbers > 4000)]
-    ticks = 5.0 + 0.008 * numbers
-    found, period = _even_clock(ticks + draws.uniform(-2e-3, 2e-3, len(ticks)))
-    assert period == pytest.approx(0.008, abs=1e-7)
-    np.testing.assert_allclose(found, ticks, atol=2e-4)
+        table = read(tmp_path / "joints.parquet", features, columns).table
+        np.testing.assert_allclose(table[features_of], wanted[features_of], atol=1e-5)
+        joints_of = table.filter(like="joint_position_")
+        np.testing.assert_allclose(joints_of, wanted[joints_of.columns], atol=1e-5)
 
 
 def test_unevenly_sampled_joints_keep_their_stamps(tmp_path):
@@ -203,39 +197,29 @@ def test_unevenly_sampled_joints_keep_their_stamps(tmp_path):
     own = pd.DataFrame(motion(sampled), columns=[f"{name}_joint" for name in NAMES])
     own.insert(0, "%time", START + np.rint(1e9 * sampled).astype(np.int64))
     own.to_csv(joints, index=False)
-    table = joined(joints, features, columns, (ROBOT, "position")).table
+    table = read(joints, features, columns).table
     found = table.filter(like="joint_position_").to_numpy()
     np.testing.assert_allclose(found, motion(sampled[0] + table["time_s"].to_numpy()), atol=2e-4)
 
 
 def test_frames_that_arrive_together_stand_in_rows_of_their_own():
-    rows = _Rows(0.0, 0.1, np.zeros((6, 1)), np.zeros((0, 2)))
-    found = _in_rows(rows, np.array([-0.5, 0.1, 0.11, 0.12, 0.45, 0.7]), np.arange(6.0)[:, None])
+    found = _in_rows(np.array([-5.0, 1.0, 1.1, 1.2, 4.5, 7.0]), np.arange(6.0)[:, None], 6)
     np.testing.assert_array_equal(found[:, 0], [np.nan, 1.0, 2.0, 3.0, np.nan, 4.0])
-
-
-def test_a_row_has_the_mean_of_the_commands_in_force():
-    rows = _Rows(0.0, 0.1, np.zeros((4, 1)), np.zeros((0, 2)))
-    found = _means(rows, np.array([0.05, 0.2]), np.array([[1.0], [3.0]]))
-    np.testing.assert_allclose(found[:, 0], [0.5, 1.0, 3.0, 3.0])
 
 
 def test_frames_faster_than_joints_all_have_rows(tmp_path):
     joints, features, columns = write_tables(tmp_path, seconds=10.0)
     pd.read_csv(joints)[::12].to_csv(joints, index=False)
-    whole = joined(joints, features, columns, (ROBOT, "position"))
-    assert whole.table["feature_valid"].sum() >= len(pd.read_csv(features)) - 2
+    whole = read(joints, features, columns)
+    assert whole.table["capture_time_s"].notna().sum() >= len(pd.read_csv(features)) - 2
 
 
-def test_frames_that_show_joints_of_a_gap_are_left_out(tmp_path):
-    joints, features, columns = write_tables(tmp_path, seconds=20.0)
-    table = pd.read_csv(joints)
-    since = (table["%time"] - START) / 1e9
-    table[(since < 8.0) | (since > 9.0)].to_csv(joints, index=False)
-    whole = joined(joints, features, columns, (ROBOT, "position"))
-    time = whole.table["time_s"]
-    assert not whole.known[(time > 7.1) & (time < 9.9)].any()
-    assert whole.known[(time > 4.0) & (time < 6.9)].any()
+def test_frames_whose_joints_may_lie_outside_the_log_do_not_count(tmp_path):
+    whole = read(*write_tables(tmp_path, seconds=20.0)).table
+    time = whole["capture_time_s"]
+    within = time.between(1.0, 19.0 - 2 * PERIOD)
+    assert whole["feature_valid"][within].all()
+    assert not whole["feature_valid"][~time.between(1.0, 19.0 + PERIOD)].any()
 
 
 def test_a_controller_is_shown_a_bag_with_a_reference(tmp_path, output_of, refusal_of):
@@ -254,21 +238,25 @@ TOPIC, POINT = (
     '[features]\ntopic = "/featur"\n',
     '[features]\nfields = ["point.x", "point.y", "{}"]\n',
 )
-KNEE = '[joints.names]\nelbow = "knee"\n'
-IN = "of the map: "
+KNEE = '[joints]\nfields = ["a", "b", "c", "d", "e", "f"]\n'
+NAME, LATE = (
+    "; name topic, time and fields in",
+    MAP.replace("[features]", "[features]\noffset = 90.0"),
+)
 WRONG = {  # files, the changed map or file, words of the refusal
     "a missing file": (None, "", "does not exist; wanted a table or a bag"),
-    "a topic": ("bag", TOPIC, f"no topic /featur; name it in [features] {IN}did you mean '/feature'"),
-    "a field": ("bag", POINT.format("point.d"), f"no field point.d; name another in [features] {IN}x, y, z"),
-    "no number": ("bag", POINT.format("point"), f"point is no number; name one of its parts in {IN[3:]}x, y, z"),
-    "a count": ("bag", '[features]\nfields = ["point.x"]\n', "[features] of the map has 1 fields; wanted 3, of x, y"),
-    "a joint of a bag": ("bag", KNEE, "joint knee is not among elbow_joint, shoulder_lift_joint"),
-    "a column": ("map", MAP.replace('"z"', '"d"'), f"no column d; name it by fields in [features] {IN}valid: stamp"),
-    "stamps": ("map", MAP.replace("%time", "time"), f"no column time; name it by time in [joints] {IN}did you mean"),
-    "a joint of a table": ("map", MAP + KNEE, "joint knee is not among %time, elbow_joint"),
+    "a topic": ("bag", TOPIC, "no topic /featur; name it in the map: did you mean '/feature'"),
+    "a field": ("bag", POINT.format("point.d"), f"no point.d{NAME} [features] of the map: did you mean"),
+    "a part": ("bag", POINT.format("point"), f"has no point{NAME} [features] of the map: did you mean"),
+    "a count": ("bag", '[features]\nfields = ["point.x"]\n', f"features of {{}}/bag has no 3 fields of values{NAME}"),
+    "a joint of a bag": ("bag", KNEE, f"has no a{NAME} [joints] of the map: valid: elbow_joint"),
+    "a column": ("map", MAP.replace('"z"', '"d"'), f"has no d{NAME} [features] of the map: valid: stamp"),
+    "stamps": ("map", MAP.replace("%time", "time"), f"no time{NAME} [joints] of the map: did you mean '%time'"),
+    "another robot": ("robot", MAP, f"has no joint_position_joint_1_rad{NAME} [joints] of the map"),
     "a key": ("map", MAP + "topics = 1\n", "has no setting 'topics': did you mean 'topic'"),
-    "a unit": ("map", MAP.replace('"ns"', '"ms"', 1), 'are 7971 s apart; if in ns, write unit = "ns" in [joints]'),
-    "no overlap": ("map", MAP.replace("[features]", "[features]\noffset = 90.0"), "do not overlap: features run from"),
+    "a unit": ("map", MAP.replace('"ns"', '"ms"', 1), 's apart; write their unit, such as unit = "ns", in the map'),
+    "a date": ("map", MAP.replace('"stamp"', '"word"'), "word is neither numbers nor dates of ISO 8601"),
+    "no overlap": ("map", LATE, "do not overlap: features run from 17"),
     "no bag": ("features.csv", "features.bag", "cannot be read as a bag"),
 }  # fmt: skip
 
@@ -276,18 +264,19 @@ WRONG = {  # files, the changed map or file, words of the refusal
 @pytest.mark.parametrize("case", WRONG)
 def test_what_cannot_be_found_is_named_with_its_remedy(tmp_path, case):
     source, text, words = WRONG[case]
-    joints, features, columns = write_tables(tmp_path, seconds=2.0)
+    joints, features, columns = write_tables(tmp_path, seconds=2.0, word="soon")
+    robot = "panda" if source == "robot" else ROBOT
     if source == "bag":
         joints = features = write_bag(tmp_path, seconds=2.0)
     if source in ("bag", "map"):
         columns.write_text(text)
-    elif source:
+    elif source == "features.csv":
         features = (tmp_path / source).rename(tmp_path / text)
-    else:
+    elif source is None:
         features.unlink()
     with pytest.raises(ConfigurationError) as refused:
-        joined(joints, features, columns, (ROBOT, "position"))
-    assert words in str(refused.value)
+        joined((joints, features, columns), (robot, "position"), "constant")
+    assert words.format(tmp_path) in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
@@ -299,15 +288,13 @@ def test_stamps_out_of_order_and_doubled_end_with_code_1(tmp_path, output_of):
         broken.to_csv(joints, index=False)
         said = output_of(*words, "--robot", ROBOT, code=1)
         assert "the stamp of sample 2 is" in said
-        assert "sort them and leave out doubled ones" in said
+        assert "sort them, leave out doubled ones" in said
 
 
 def test_a_log_and_two_streams_are_not_given_together(tmp_path, refusal_of):
     joints, features, columns = write_tables(tmp_path, seconds=2.0)
-    assert "wanted either a log, or --joints" in refusal_of("identify", joints, "--joints", joints)
-    assert "wanted either a log, or --joints" in refusal_of("identify", "--features", features)
+    assert "--joints is in place of a log" in refusal_of("identify", joints, "--joints", joints)
+    assert "missing argument 'LOG', or --joints" in refusal_of("identify", "--features", features)
     words = ("identify", "--joints", joints, "--features", features, "--columns", columns)
-    assert "is read itself; name another file" in refusal_of(*words, "--out", features)
-    assert "--run names a run of a results folder" in refusal_of(*words, "--run", "a")
-    assert COMMANDS is COMMAND_KIND
-    assert Path(joints).exists()
+    assert "is the log itself; name another file" in refusal_of(*words, "--out", features)
+    assert "--joints is in place of a log and --run" in refusal_of(*words, "--run", "a")
