@@ -18,8 +18,8 @@ EXTRAS: Final = {  # top-level module -> extra
     "optuna": "tune",
     "distributed": "cluster",
     "gymnasium": "gym",
-    "mcap": "mcap",
     "rosbags": "bag",
+    "mcap_ros2": "bag",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
 }
