@@ -29,7 +29,6 @@ PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that i
 LOG = typer.Argument(
     help="Results folder, or a table (.csv, .parquet) with the columns of its steps; none with --joints."
 )
-STREAM: Final = "table (.csv, .parquet) or bag (.mcap, rosbag2, .db3, .bag; extra bag)"
 LEGEND: Final = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
     "The log does not answer to the controller, so that this does not say how well it would have done."
@@ -41,7 +40,11 @@ class StreamOptions:
     """A log of two streams with stamps of their own."""
 
     joints: Annotated[
-        Path | None, option("FILE", f"Joints in place of a log, at their own stamps: {STREAM}.")
+        Path | None,
+        option(
+            "FILE",
+            "Joints at their own stamps in place of a log: table (.csv, .parquet) or bag (.mcap, rosbag2, .db3, .bag).",
+        ),
     ] = None
     features: Annotated[
         Path | None, option("FILE", "Features at theirs, likewise; default: the file of joints.")
@@ -216,10 +219,10 @@ def _logged(
             raise ConfigurationError(
                 "--joints is in place of a log and --run, and wants a --controller"
             )
-        if out and out in (streams.joints, features, streams.columns):
+        files = (streams.joints, features, streams.columns)
+        if out and out.exists() and any(out.samefile(file) for file in files if file):
             raise ConfigurationError(f"--out {out} is the log itself; name another file")
-        read = joined((streams.joints, features, streams.columns), named, controller)
-        return str(features), *read
+        return str(features), *joined(files, named, controller)
     if not log or streams != USUAL_STREAMS:
         raise ConfigurationError("missing argument 'LOG', or --joints with a file of joints")
     if not log.exists():

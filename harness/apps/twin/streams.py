@@ -147,14 +147,14 @@ def _seconds(what: str, table: pd.DataFrame, column: str, unit: str) -> FloatArr
 
 
 def _check_order(what: str, time: FloatArray) -> None:
-    """Refuse stamps that do not grow, or are likely in another unit."""
-    steps = np.diff(time, prepend=-np.inf)
-    row = int(np.argmin(steps > 0.0))
-    if steps[row] <= 0.0:
-        found = f"the stamp of sample {row} is {steps[row]:.6g} s after the one before"
-        remedy = f"sort them, leave out doubled ones, or take other stamps, such as {RECEIVED}"
+    """Refuse stamps that do not grow, are too few, or are likely in another unit."""
+    steps = np.diff(time)
+    grows = np.append(steps > 0.0, steps.size > 0)
+    if not grows.all():
+        found = f"stamp {np.argmin(grows) + 1} of {len(time)} is not later than the one before"
+        remedy = f"sort two or more, leave out doubled ones, or take others, such as {RECEIVED}"
         raise UnevenRows(f"{what}: {found}: {remedy}")
-    usual = float(np.median(steps))
+    usual = np.median(steps)
     if usual > MAX_STEP:
         remedy = 'write their unit, such as unit = "ns", in the map'
         raise ConfigurationError(f"{what}: stamps are {usual:.4g} s apart; {remedy}")

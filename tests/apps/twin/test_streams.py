@@ -287,8 +287,23 @@ def test_stamps_out_of_order_and_doubled_end_with_code_1(tmp_path, output_of):
     for broken in (whole.iloc[[0, 2, 1, *range(3, len(whole))]], whole.iloc[[0, 1, 1, 2]]):
         broken.to_csv(joints, index=False)
         said = output_of(*words, "--robot", ROBOT, code=1)
-        assert "the stamp of sample 2 is" in said
-        assert "sort them, leave out doubled ones" in said
+        assert "is not later than the one before" in said
+        assert "leave out doubled ones" in said
+
+
+def test_a_stream_without_any_finite_feature_is_refused(tmp_path, refusal_of):
+    joints, features, columns = write_tables(tmp_path, seconds=2.0, x=np.nan)
+    words = ("identify", "--joints", joints, "--features", features, "--columns", columns)
+    assert "has no rows; it needs stamp" in refusal_of(*words)
+
+
+def test_frames_without_a_detection_are_no_frames(tmp_path):
+    joints, features, columns = write_tables(tmp_path, seconds=5.0)
+    table = pd.read_csv(features)
+    table.loc[::3, "y"] = np.nan
+    table.to_csv(features, index=False)
+    found = read(joints, features, columns).table["capture_time_s"].notna().sum()
+    assert found <= table["y"].notna().sum() < len(table)
 
 
 def test_a_log_and_two_streams_are_not_given_together(tmp_path, refusal_of):
