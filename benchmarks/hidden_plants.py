@@ -113,22 +113,33 @@ def hidden(seed: int, plant: str, words: str) -> list[dict[str, Any]]:
         find_sensing("position").nominal(find_robot(robot)),
     )
     experiment.plant.close()
+    times = {"latency": latency, "command_delay": delay, "lag": sections.get("lag", np.nan)}
+    return judged(log, nominal, draw_robot(request)[0], times, about)
+
+
+def judged(
+    log: Log,
+    nominal: RobotModel,
+    robot_drawn: RobotModel,
+    times: dict[str, float],
+    about: dict[str, Any],
+) -> list[dict[str, Any]]:
+    """Identify a log and return a row a parameter, given the true robot and the true times [s]."""
     others = {
         name: find_robot(name).nominal
         for name in ROBOTS
-        if name != robot and find_robot(name).n == log.spec.n
+        if name != about["robot"] and find_robot(name).n == log.spec.n
     }
     began = time.perf_counter()
     said, found = mistakes(log, nominal, lambda: others)
     response = command_response(log)
     about |= {"seconds": time.perf_counter() - began, "said": said}
     rows: list[tuple[Any, ...]] = []
-    robot_drawn = draw_robot(request)[0]
-    true = parameters(robot_drawn, nominal) | {"latency": latency}
+    true = parameters(robot_drawn, nominal) | {"latency": times["latency"]}
     if found is not None:
         about["jacobian"] = jacobian_error(log, found.model(nominal), robot_drawn)
     if response is not None:
-        errors = response.delay - delay, response.lag - sections.get("lag", np.nan)
+        errors = response.delay - times["command_delay"], response.lag - times["lag"]
         sizes = np.maximum(np.sqrt(np.diag(response.covariance)), 1e-4)
         told = np.isfinite(errors)  # the drive of an engine has no lag of first order
         rows += zip(("command_delay", "lag"), errors, sizes, told, strict=True)
@@ -146,13 +157,13 @@ def hidden(seed: int, plant: str, words: str) -> list[dict[str, Any]]:
 def main() -> None:
     """Print the tables."""
     given = options(__doc__, plant="kinematic", robots=200, first=81000, mismatch="")
-    table = pd.DataFrame(
-        [
-            row
-            for seed in range(given.first, given.first + given.robots)
-            for row in hidden(seed, given.plant, given.mismatch)
-        ]
-    )
+    seeds = range(given.first, given.first + given.robots)
+    rows = [row for seed in seeds for row in hidden(seed, given.plant, given.mismatch)]
+    print_summary(pd.DataFrame(rows))
+
+
+def print_summary(table: pd.DataFrame) -> None:
+    """Print coverage and errors of a table with a row a parameter."""
     runs = table.drop_duplicates("seed")
     print(
         f"{len(runs)} logs, {(runs['said'] != '').sum()} with a line, median {runs['seconds'].median():.1f} s a log"

@@ -105,6 +105,8 @@ def lay_out(reader: Reader, text: str) -> None:
     if "my_ur10e.yaml" in text:
         (folder / "my_ur10e.yaml").write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
         (folder / "my_arm.urdf").write_text(re.sub(r"\bhand\b", "tool0", odd_urdf()))
+    if "./excite.py" in text:
+        shutil.copy(ROOT / "docs" / "examples" / "excite.py", folder)
     if "./nominal-rate" in text:
         shutil.copytree(ROOT / "docs" / "examples" / "nominal-rate", folder / "nominal-rate")
     if "shadow first" in text:

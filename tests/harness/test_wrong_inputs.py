@@ -251,7 +251,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("suite", "--challenges", "severe,zeros45", "--controllers", "constant", "--out", "new", "--set",
       "circle.lap_time=-3"), "circle.lap_time must be above 0, got -3"),
     # a log beside a controller, and exports
-    (("shadow",), "missing argument 'LOG'; see servobench shadow --help"),
+    (("shadow",), "missing argument 'LOG', or --joints with a file of joints"),
     (("shadow", "none"), "none does not exist; wanted a results folder or a table"),
     (("shadow", "full"), "full is not a results folder"),
     (("shadow", "file", "--controller", "constant"), "file must be a results folder, or a table in .csv or .parquet"),

@@ -19,7 +19,9 @@ def export(
     out: Annotated[Path, option("FOLDER", "New folder for the files.")],
     format_: Annotated[
         str,
-        named_option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap)."),
+        named_option(
+            "--format", "NAME", "csv, or mcap: bags for Foxglove, rerun and ROS 2 (extra bag)."
+        ),
     ] = "csv",
     run: Annotated[
         str | None, named_option("--run", "RUN_ID", "One run alone; default: all.")

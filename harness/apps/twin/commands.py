@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final
@@ -21,12 +21,13 @@ from servobench.plant.contract.files import accessing, user_path, write_atomical
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from servobench.harness.apps.twin.identification import Clocks
     from servobench.harness.run.resolution import ResolvedRun
 
 IDENTIFYING: Final = "constant"  # a controller, which identification does not run
 PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that is easier to write
 LOG = typer.Argument(
-    help="Results folder, or a table (.csv, .parquet) with the columns of its steps."
+    help="Results folder, or a table (.csv, .parquet) with the columns of its steps; none with --joints."
 )
 LEGEND: Final = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
@@ -34,14 +35,37 @@ LEGEND: Final = (
 )
 
 
+@dataclass(frozen=True)
+class StreamOptions:
+    """A log of two streams with stamps of their own."""
+
+    joints: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "Joints at their own stamps in place of a log: table (.csv, .parquet) or bag (.mcap, rosbag2, .db3, .bag).",
+        ),
+    ] = None
+    features: Annotated[
+        Path | None, option("FILE", "Features at theirs, likewise; default: the file of joints.")
+    ] = None
+    columns: Annotated[
+        Path | None, option("FILE", "TOML file with topics, fields, columns, joints and units.")
+    ] = None
+
+
+USUAL_STREAMS: Final = StreamOptions()
+
+
 def shadow(
-    log: Annotated[Path, LOG],
+    log: Annotated[Path | None, LOG] = None,
     controller: Annotated[
         str | None, option(CONTROLLER, "Name or file of the controller; default: that of the run.")
     ] = None,
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
+    streams: StreamOptions = USUAL_STREAMS,
     out: Annotated[
         Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")
     ] = None,
@@ -56,11 +80,12 @@ def shadow(
     from servobench.harness.config.registry import find_controller
 
     chosen = None if controller is None else selection.choose("controllers", controller)
-    if chosen is not None and find_controller(chosen).needs_truth and not log.is_dir():
+    is_folder = log is not None and log.is_dir()
+    if chosen is not None and find_controller(chosen).needs_truth and not is_folder:
         raise ConfigurationError(
-            f"controller {chosen} is given the true robot, which {log} does not have"
+            f"controller {chosen} is given the true robot, which {log or 'a bag'} does not have"
         )
-    resolved, table = _logged(log, run, chosen, (robot, sensing), out)
+    log_name, resolved, table, _ = _logged(log, run, chosen, (robot, sensing), out, streams)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     name, apart, ahead = resolved.request.controller, differences(seen), predictions(seen)
@@ -70,7 +95,7 @@ def shadow(
         say(f"table in {out}")
     elif apart.empty and ahead.empty:
         raise ConfigurationError(
-            f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller"
+            f"{log_name} has no commands to compare with; --out FILE.csv keeps those of the controller"
         )
     if ahead.empty:
         say(f"{name} gives no Jacobian that could predict a feature")
@@ -86,10 +111,11 @@ def shadow(
 
 
 def identify(
-    log: Annotated[Path, LOG],
+    log: Annotated[Path | None, LOG] = None,
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
+    streams: StreamOptions = USUAL_STREAMS,
     out: Annotated[
         Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")
     ] = None,
@@ -110,7 +136,9 @@ def identify(
     from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
 
     try:
-        resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
+        name, resolved, table, clocks = _logged(
+            log, run, IDENTIFYING, (robot, sensing), out, streams
+        )
     except UnevenRows as error:
         say(str(error))
         sys.exit(FAILED)
@@ -122,13 +150,13 @@ def identify(
             f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}"
         )
     if (
-        not log.is_dir()
+        log is None or not log.is_dir()
     ):  # a table does not say at which speed commands are clipped: at that of the robot
         resolved = replace(
             resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
         )
     experiment = build(resolved)
-    rows = read_log(experiment.plant.spec, table)
+    rows = read_log(experiment.plant.spec, table, clocks=clocks)
     experiment.plant.close()
     apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
@@ -137,10 +165,10 @@ def identify(
         )
         response = command_response(rows)
     if found is None:
-        say(f"{log}: {mistake}")
+        say(f"{name}: {mistake}")
         sys.exit(FAILED)
     print_tables(
-        [(f"{log} against the nominal {own.title}, where they differ", estimates(found, response))]
+        [(f"{name} against the nominal {own.title}, where they differ", estimates(found, response))]
     )
     say("\n".join(remarks(rows, found, response)))
     if out is not None:
@@ -170,12 +198,33 @@ def _as_clock(period: float) -> str:
 
 
 def _logged(
-    log: Path, run: str | None, controller: str | None, named: tuple[str, str], out: Path | None
-) -> tuple[ResolvedRun, DataFrame]:
-    """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
+    log: Path | None,
+    run: str | None,
+    controller: str | None,
+    named: tuple[str, str],
+    out: Path | None,
+    streams: StreamOptions,
+) -> tuple[str, ResolvedRun, DataFrame, Clocks | None]:
+    """Return the name of a log, the run that it is taken for, its rows, and the clocks of its streams, if any.
+
+    The run is that of a controller, None for that of the log, with robot and sensing as named.
+    """
+    from servobench.harness.apps.twin.joining import joined
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.batch.results import ResultsFolder
 
+    if streams.joints is not None:
+        features = streams.features or streams.joints
+        if log or run or not controller:
+            raise ConfigurationError(
+                "--joints is in place of a log and --run, and wants a --controller"
+            )
+        files = (streams.joints, features, streams.columns)
+        if out and out.exists() and any(out.samefile(file) for file in files if file):
+            raise ConfigurationError(f"--out {out} is the log itself; name another file")
+        return str(features), *joined(files, named, controller)
+    if not log or streams != USUAL_STREAMS:
+        raise ConfigurationError("missing argument 'LOG', or --joints with a file of joints")
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
     if out is not None and out.exists() and out.samefile(log):
@@ -187,11 +236,11 @@ def _logged(
                 raise ConfigurationError(
                     f"--{word} {given} is not that of the run, {own}; leave it out for a folder"
                 )
-        return resolved, table
+        return str(log), resolved, table, None
     if run is not None:
         raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
     if controller is None:
         raise ConfigurationError(
             f"{log} does not say which controller to show it to; name one with --controller"
         )
-    return logged_in_file(log, controller, *named)
+    return str(log), *logged_in_file(log, controller, *named), None

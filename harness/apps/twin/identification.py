@@ -102,6 +102,16 @@ STEP: Final = 1e-6  # [1] step of finite differences, in prior deviations
 MAX_LAGS: Final = 100  # [frames] longest lag in the correlation time
 
 
+class Clocks(NamedTuple):
+    """Clocks of a log whose frames are stamped by a clock of known or sought offset to that of the joints."""
+
+    # Latencies among which that behind stamps is sought [s]; a negative one is an offset of clocks, too.
+    lowest: float
+    highest: float
+    # [s] By how much longer frames take from stamp to recording than joints; None where one clock did not record both.
+    delivery: float | None
+
+
 class Log(NamedTuple):
     """Rows of a log."""
 
@@ -115,6 +125,9 @@ class Log(NamedTuple):
     captured: (
         FloatArray  # (k,) [s] when frames were exposed by the camera's clock; NaN without a stamp
     )
+    clocks: Clocks | None = (
+        None  # None for stamps whose offset to the rows is that of the mean frame
+    )
 
     @property
     def stamped(self) -> BoolArray:
@@ -125,17 +138,19 @@ class Log(NamedTuple):
     def lateness(self) -> FloatArray:
         """By how much each stamped frame came later than they do in the mean, (k,) [s]; 0 for others.
 
-        The mean takes the unknown offset of the camera's clock away; its drift is a parameter (`drift`).
+        The mean takes the unknown offset of the camera's clock away; its drift is a parameter (`drift`). Where clocks
+        are given, nothing is taken away: the offset is part of the latency.
         """
         stamped = self.stamped
         if not stamped.any():
             return np.zeros(len(self.time))
         late = self.time - self.captured
-        return np.where(stamped, late - np.mean(late[stamped]), 0.0)
+        usual = 0.0 if self.clocks else np.mean(late[stamped])
+        return np.where(stamped, late - usual, 0.0)
 
     @property
     def frame_time(self) -> FloatArray:
-        """When the frames of rows came, or by their stamps would have come at the mean latency, (k,) [s]."""
+        """When frames came, or by their stamps would have at the mean latency; with clocks their stamps, (k,) [s]."""
         return self.time - self.lateness
 
     def farthest_joint(self) -> tuple[float, str]:
@@ -217,7 +232,9 @@ def _repeated(features: FloatArray) -> BoolArray:
     return np.asarray((~changed | placeholder) & beside_large[runs])
 
 
-def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:
+def read_log(
+    spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES, clocks: Clocks | None = None
+) -> Log:
     """Return the rows of a table with columns as `steps.parquet` has them, `spec.period` apart.
 
     Raises:
@@ -244,7 +261,7 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     elif any(str(name).startswith(VELOCITY) for name in table):
         missing = ", ".join(lacking)
         remark(f"the log has columns {VELOCITY}_… but no {missing}: commands are left out")
-    log = Log(spec, time, joints, features, valid, commands, _stamps(table))
+    log = Log(spec, time, joints, features, valid, commands, _stamps(table), clocks)
     _check_clock(log)
     count = len(frames_of(log))
     if count < least:
@@ -414,7 +431,8 @@ class _Problem:
         self._last_key: Any = None
         self._last: Any = None
         first_guess = deviated(model, begin)
-        latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
+        lowest, highest, _ = log.clocks or Clocks(0.0, MAX_LATENCY, None)
+        latencies = np.arange(lowest, highest + 1e-9, LATENCY_STEP)
         placed = self._placed(first_guess, latencies, np.zeros_like(latencies))
         latency = placed.latency
         if not pixels:

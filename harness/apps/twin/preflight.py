@@ -193,7 +193,7 @@ def _large_errors(log: Log, robot: Identified) -> str:
 def _clocks(log: Log, robot: Identified) -> str:
     """Name clocks of which one is behind the other, or gains on it."""
     latency, deviation = robot.estimate("latency")
-    if 1e3 * latency < -max(CERTAIN * 1e3 * deviation, MIN_DRIFT):
+    if log.clocks is None and 1e3 * latency < -max(CERTAIN * 1e3 * deviation, MIN_DRIFT):
         before = f"frames come {-1e3 * latency:.0f} ms before the joints are where they show them"
         return f"{before}, as clocks of camera and joints are apart: stamp both with one"
     drift, deviation = robot.estimate("drift")

@@ -108,6 +108,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     if log.stamped.any():
         sensing["stamps"] = True
         late = log.lateness[log.stamped]
+        late = late - late.mean()
         wave = fitted_wave(log.frame_time[log.stamped], late, np.ones_like(late))
         if wave is not None and wave[-1] < WAVE_RESIDUAL_SHARE:
             pace, sizes, _ = wave
@@ -138,7 +139,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
         noise = lateness.noise
         outliers = ~lateness.kept
         lost = max(0.0, lost - waiting.missing)
-    else:
+    elif log.clocks is None:
         rows = frame_period(log) / period
         if abs(rows - round(rows)) > MIN_ROW_PART:
             wait = 0.5 * period  # until the next control instant

@@ -7,7 +7,14 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.apps.twin.drive import MIN_MOTION, SUSPECT_SHARE, Response, untold_response
-from servobench.harness.apps.twin.identification import EXTRAS, Identified, Log, kind_of, prior
+from servobench.harness.apps.twin.identification import (
+    EXTRAS,
+    Clocks,
+    Identified,
+    Log,
+    kind_of,
+    prior,
+)
 from servobench.harness.apps.twin.sensor import lost_share, sensor
 from servobench.plant.robot.twin import TIMES
 
@@ -58,6 +65,8 @@ def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
 def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]:
     """Return lines on a log: its noise, its unexplained residuals, and the parameters that it leaves open."""
     lines = [_noise_line(log, robot), _residuals_line(log, robot)]
+    if log.clocks:
+        lines.append(_clock_line(log.clocks, robot))
     motions = zip(log.spec.joint_names, np.ptp(log.joints, axis=0), strict=True)
     still = [name for name, motion in motions if motion < MIN_MOTION]
     if still:
@@ -87,6 +96,17 @@ def _noise_line(log: Log, robot: Identified) -> str:
     outliers = 1.0 - robot.inliers.mean()
     return (
         f"residuals [{unit}]: {noise}; outliers {outliers:.1%}, lost frames {lost_share(log):.1%}"
+    )
+
+
+def _clock_line(clocks: Clocks, robot: Identified) -> str:
+    """Return what the latency of a log with stamps of its own holds, and the offset of its clocks if it is told."""
+    if clocks.delivery is None:
+        return "latency holds the offset of the clocks, which one bag with times of recording tells"
+    latency, deviation = robot.estimate("latency")
+    offset = f"{1e3 * (latency - clocks.delivery):+.1f} ± {1960.0 * deviation:.1g} ms"
+    return (
+        f"camera's clock ahead of that of the joints, if frames are stamped when exposed: {offset}"
     )
 
 
