@@ -8,18 +8,22 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option
 from servobench.harness.cli.terminal import say
 
+OFFERED = (
+    "calibrating_mfac,regression_mfac,ukf_mfac,ukf_mpc,rbfnn_mfac,rbf_pid,rls,broyden,cfdl_mfac,"
+    "constant,calibrated,nmpc_calibrated"
+)
+
 
 def play(
     *,
     plant: Annotated[str, option(PLANT, "The plant that is played with.")] = "kinematic",
     controllers: Annotated[
-        str,
+        str | None,
         option(
             CONTROLLER.several(),
-            "Comma-separated names or files to choose from; the first one begins.",
+            "Comma-separated names or files to choose from; default: equipped methods and bounds.",
         ),
-    ] = "calibrating_mfac,regression_mfac,ukf_mfac,ukf_mpc,rbfnn_mfac,rbf_pid,rls,broyden,cfdl_mfac,"
-    "constant,calibrated,nmpc_calibrated",
+    ] = None,
     robot: options.RobotOption = "ur5",
     task: options.TaskOption = "circle",
     mismatch: options.MismatchOption = options.DEFAULT_MISMATCH,
@@ -27,9 +31,9 @@ def play(
     host: Annotated[
         str, option("ADDRESS", "One address of this machine to listen on.")
     ] = "127.0.0.1",
-    port: Annotated[int, option("PORT", "Of the page.", min=1, max=65535)] = 8090,
+    port: Annotated[int, option("PORT", "Of the page.", min=1)] = 8090,
 ) -> None:
-    """Steer runs on a page in the browser: drag the target, switch methods, knock the camera.
+    """Steer runs on a page: drag the target, knock the camera.
 
     Only this machine reaches the page, unless --host says otherwise. Ctrl-C ends it.
     """
@@ -42,7 +46,7 @@ def play(
     from servobench.harness.run.tasks import choose_task
     from servobench.plant.robot.mismatch import Mismatch
 
-    names = selection.split("controllers", controllers, robot=robot)
+    names = selection.split("controllers", controllers or OFFERED, robot=robot)
     chosen = selection.choose("plants", plant), names[0], choose_task(task)
     request = RunRequest(*chosen, Mismatch.parse(mismatch), 0, robot=robot)
     settings = overrides.settings()

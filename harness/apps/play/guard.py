@@ -27,7 +27,9 @@ def open_server(host: str, port: int) -> viser.ViserServer:
     """
     with configuration_errors("--host: "):
         IPv4Address(host)
-    with configuration_errors(f"{host}:{port} cannot be opened, try another --port: ", OSError):
+    with configuration_errors(
+        f"{host}:{port} cannot be opened, try another --port: ", OSError, OverflowError
+    ):
         socket.create_server((host, port)).close()
     rich.get_console().quiet = True  # on which viser prints
     origins = [None, Origin(f"http://{host}:{port}"), Origin(f"http://localhost:{port}")]
