@@ -67,11 +67,11 @@ def joined(
         arrived = seen.received - delay
     begin, *_, end = moved.time.tolist()
     period = min(_period(moved.time), _period(captured))
-    time = np.arange(begin, end, period)
+    time = np.arange(0.0, end - begin, period)
     names = column_names(spec)
-    positions = PchipInterpolator(moved.time, moved.values)(time)
+    positions = PchipInterpolator(moved.time - begin, moved.values)(time)
     table = pd.DataFrame(positions, columns=names["joint_position"])
-    table.insert(0, TIME, time - begin)
+    table.insert(0, TIME, time)
     frames = _in_rows(
         (arrived - begin) / period, np.column_stack([seen.values, captured]), len(time)
     )
@@ -91,7 +91,7 @@ def joined(
             if own != StreamMap():
                 raise
             continue
-        newest = np.searchsorted(stream.time, time + 0.5 * period) - 1
+        newest = np.searchsorted(stream.time - begin, time + 0.5 * period) - 1
         table[names[USUAL[kind][0]]] = stream.values[np.maximum(newest, 0)]
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
     settings = Settings({"run": {"period": period}, PLANT: {"command_delay": 0.0}})
