@@ -78,7 +78,6 @@ class Link:
         self.lost = 1
         self.sent = deque(maxlen=100)
         self.feature = None
-        self.unmoved = np.nan
         self.fault = ""
 
     @property
@@ -136,13 +135,13 @@ class Link:
         found = np.isfinite(ball).all()
         if found:
             if not np.array_equal(ball, self.feature):
-                # Unknown for the first picture, which is the same until the arm is seen to move
-                self.posture = q + self.unmoved
-                self.unmoved = 0.0
+                # By its latency the first picture stays while the arm begins to move [rad]
+                self.still = 0.1 if self.feature is None else self.config.still
+                self.posture = q
             self.feature = ball
             self.captured = self.stamps[BALL]
-        # A picture that stays the same while the joints move is frozen
-        found = found and not np.ptp(q - self.posture) >= self.config.still
+            # A picture that stays the same while the joints move is frozen
+            found = not np.ptp(q - self.posture) >= self.still
         self.lost = 0 if found else self.lost + 1
         if self.lost > 1:
             raise RuntimeError(f"{BALL}: not found, or the same in two frames as the joints move")

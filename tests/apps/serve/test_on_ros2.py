@@ -228,12 +228,18 @@ def test_a_backlog_is_dropped_with_a_line():
     assert lines == ["the plant is slower than the wall clock: 300 ms are left out"]
 
 
-def test_the_first_picture_may_stay_until_the_arm_is_seen_to_move():
+def test_the_first_picture_may_stay_while_the_arm_begins_to_move():
     own = link()
-    for k in range(4):
-        own.hear_joints(joint_states(own, k * 50_000_000, START + 0.01 * k), 0.05 * k)
+    for k in range(7):
+        own.hear_joints(
+            joint_states(own, k * 50_000_000, START + 0.02 * k * np.eye(6)[0]), 0.05 * k
+        )
         own.hear_ball(ball(k * 50_000_000, (0.0, 0.0, 1.0)), 0.05 * k)
+        if k == 6:
+            with pytest.raises(RuntimeError, match="the same in two frames as the joints move"):
+                own.observe()
+            return
         seen = own.observe()
-        assert seen.feature_valid
+        assert seen.feature_valid == (k < 5)
         assert seen.capture_time == pytest.approx(0.05 * k)
         own.send(np.full(6, 0.2), 0.05 * k)
