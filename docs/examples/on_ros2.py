@@ -34,7 +34,7 @@ try:
 except ImportError:
     Writer = None
 
-JOINTS, BALL, COMMANDS = "joint_states", "ball", "forward_velocity_controller/commands"
+JOINTS, BALL, COMMANDS = "joint_states", "feature", "forward_velocity_controller/commands"
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """A plant as the robot of ROS 2: joint states and the ball go out as messages, joint velocities come in.
 
     joint_states                            sensor_msgs/JointState        500 Hz; in lockstep once a period
-    ball                                    geometry_msgs/PointStamped    a frame: the ball's centre, camera frame [m];
+    feature                                 geometry_msgs/PointStamped    a frame: the ball's centre, camera frame [m];
                                                                           NaN where it was not found
     clock                                   rosgraph_msgs/Clock           in lockstep
     forward_velocity_controller/commands    std_msgs/Float64MultiArray    joint velocities in the arm's order [rad/s]
@@ -88,13 +88,13 @@ class Robot:
         node.create_subscription(Float64MultiArray, commands, self._receive, QUEUE)
         self._clock = node.create_publisher(Clock, "/clock", QUEUE)
         self._joints = node.create_publisher(JointState, "joint_states", QUEUE)
-        self._ball = node.create_publisher(PointStamped, "ball", QUEUE)
+        self._ball = node.create_publisher(PointStamped, "feature", QUEUE)
         due = time.monotonic()
         clocked = "lockstep"
         if not self._lockstep:
             self._epoch = node.get_clock().now().nanoseconds
             clocked = "real time"
-        self._say(f"serving joint_states and ball, following {commands}, in {clocked}")
+        self._say(f"serving joint_states and feature, following {commands}, in {clocked}")
         self._say("conformance with these messages is checked, safety is not; Ctrl-C ends it")
         has_frame = True
         while True:

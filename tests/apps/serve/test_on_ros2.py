@@ -24,12 +24,12 @@ FAULTS = {  # planted fault -> the reason that is named
     "joints_backwards": "joint_states: late, lost or frozen",
     "joints_nan": "joint_position must be finite",
     "joint_missing": "KeyError('wrist_3_joint')",
-    "ball_lost": "ball: late, lost or frozen",
-    "ball_late": "ball: late, lost or frozen",
-    "stamps_frozen": "ball: late, lost or frozen",
-    "picture_frozen": "ball: not found, or the same in two frames",
-    "ball_nan": "ball: not found, or the same in two frames",
-    "ball_infinite": "ball: not found, or the same in two frames",
+    "ball_lost": "feature: late, lost or frozen",
+    "ball_late": "feature: late, lost or frozen",
+    "stamps_frozen": "feature: late, lost or frozen",
+    "picture_frozen": "feature: not found, or the same in two frames",
+    "ball_nan": "feature: not found, or the same in two frames",
+    "ball_infinite": "feature: not found, or the same in two frames",
     "node_killed": "joint_states: late, lost or frozen",
     "second_commander": "another node commands the robot",
     "controller_late": "the controller is late",
@@ -102,7 +102,7 @@ def test_a_first_frame_without_a_ball_is_an_end():
     own = link()
     own.hear_joints(joint_states(own, 1, START), 0.0)
     own.hear_ball(ball(1, [math.nan] * 3), 0.0)
-    with pytest.raises(RuntimeError, match="ball: not found"):
+    with pytest.raises(RuntimeError, match="feature: not found"):
         own.observe()
 
 

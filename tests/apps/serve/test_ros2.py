@@ -182,5 +182,5 @@ def test_a_bag_has_all_messages(tmp_path):
         for connection, _, packed in reader.messages():
             reader.deserialize(packed, connection.msgtype)
             counts[connection.topic] = counts.get(connection.topic, 0) + 1
-    assert set(counts) == {"/joint_states", "/ball", "/forward_velocity_controller/commands"}
+    assert set(counts) == {"/joint_states", "/feature", "/forward_velocity_controller/commands"}
     assert min(counts.values()) >= 39
