@@ -96,7 +96,13 @@ def parse_platforms(text: str | None) -> tuple[Platform, ...]:
     return tuple(PLATFORMS[name] for name in dict.fromkeys(names))
 
 
-def compile_library(folder: Path, sources: Sequence[str], target: Platform, library: Path) -> None:
+def compile_library(
+    folder: Path,
+    sources: Sequence[str],
+    target: Platform,
+    library: Path,
+    further: Sequence[str] = (),
+) -> None:
     """Compile `sources` in `folder` into the shared library `library`.
 
     Args:
@@ -104,6 +110,7 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
         sources: file names.
         target: platform of the library.
         library: the file to write.
+        further: flags, which override the usual ones.
 
     Raises:
         CompilerMissing: no compiler for this platform is installed.
@@ -112,7 +119,8 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
     library.parent.mkdir(parents=True, exist_ok=True)
     output = library.resolve()
     libraries = () if target.suffix == ".dll" else ("-lm",)
-    arguments = [*_compiler(target), *CODE, *target.flags, *sources, "-o", str(output), *libraries]
+    flags = [*CODE, *target.flags, *further]
+    arguments = [*_compiler(target), *flags, *sources, "-o", str(output), *libraries]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": "315532800", "ZERO_AR_DATE": "1"}
     done = subprocess.run(
         arguments,

@@ -77,8 +77,9 @@ class Product:
             f"{self.dialect.names.prefix}.c",
         )
         texts = {name: committed(MACHINERY, name) for name in machinery}
-        for name in (f"{self.core}.h", "model.h", "model.c"):
-            texts[name] = committed(self.folder, name)
+        for each in (files("servobench.fmus") / self.folder).iterdir():
+            if each.name.endswith((".c", ".h")):
+                texts[each.name] = committed(self.folder, each.name)
         standard = files("fmpy") / "c-code"
         for name in self.dialect.headers:
             texts[name] = (standard / name).read_text(encoding="utf-8")

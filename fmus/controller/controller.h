@@ -1,10 +1,10 @@
-/* The generated step, in CasADi's calling convention: inputs and outputs by pointer, `iw` and `w` scratch. */
+/* The generated functions; they return the code of a fault, or 0. */
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
 
-/* u -> x(0), fault */
-int controller_start(const double **arg, double **res, int *iw, double *w, int mem);
-/* x(k), u -> x(k+1), y, fault */
-int controller_step(const double **arg, double **res, int *iw, double *w, int mem);
+/* x = x(0) for u; y is not used */
+double controller_start(double *x, const double *u, double *y);
+/* x(k) becomes x(k+1), y = y(k) */
+double controller_step(double *x, const double *u, double *y);
 
 #endif

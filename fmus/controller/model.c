@@ -2,7 +2,6 @@
 #include "controller.h"
 
 #include <math.h>
-#include <stdlib.h>
 #include <string.h>
 
 /* How far from a sampling instant the importer's time may be, beside rounding [1 of the period]. */
@@ -59,42 +58,22 @@ const char *model_check(const Model *model, double step)
     return endless ? "the step is longer than a million periods" : NULL;
 }
 
-/* Computes x(k+1) and y(k) for the present inputs; `scratch` has room for all of it. */
-static void compute(Model *model, double *scratch)
+/* Computes x(k+1) and y(k) for the present inputs. */
+static void compute(Model *model)
 {
-    double *u = scratch, *first = u + 1 + N_SETTABLE, *w = first + N_MEMORY, fault = 0.0;
-    const double *arguments[N_POINTERS];
-    double *results[N_POINTERS];
-    int iw[N_WHOLE_WORK];
+    double u[1 + N_SETTABLE], fault = 0.0;
     u[0] = model->begun ? model->first + model->sample * PERIOD : model->time;
     memcpy(u + 1, model->values, N_SETTABLE * sizeof(double));
-    model->fault = 0.0;
-    const double *memory = model->memory;
-    if (!model->begun) {
-        arguments[0] = u;
-        results[0] = first;
-        results[1] = &fault;
-        controller_start(arguments, results, iw, w, 0);
-        memory = first;
-    }
-    arguments[0] = memory;
-    arguments[1] = u;
-    results[0] = model->next;
-    results[1] = model->answers;
-    results[2] = &model->fault;
-    controller_step(arguments, results, iw, w, 0);
+    memcpy(model->next, model->memory, sizeof model->next);
+    if (!model->begun) fault = controller_start(model->next, u, model->answers);
+    model->fault = controller_step(model->next, u, model->answers);
     if (fault != 0.0) model->fault = fault;
     model->known = 1;
 }
 
 static const char *ensure_known(Model *model)
 {
-    if (!model->known) {
-        double *scratch = malloc((1 + N_SETTABLE + N_MEMORY + N_WORK) * sizeof *scratch);
-        if (scratch == NULL) return "out of memory";
-        compute(model, scratch);
-        free(scratch);
-    }
+    if (!model->known) compute(model);
     if (model->fault == 0.0) return NULL;
     return model->fault == FAULT_NOT_DEFINITE ? "a covariance is not positive definite"
                                               : "the estimate or the command is not finite";

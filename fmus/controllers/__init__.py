@@ -1,1 +1,1 @@
-"""Records numpy code as CasADi expressions, from which C is generated: one formula for both."""
+"""Records numpy code as programs, from which C is written: one formula for both."""

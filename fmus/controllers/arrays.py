@@ -1,8 +1,8 @@
-"""Arrays whose numbers are CasADi expressions, in the place of numpy's, and numpy's ufuncs over them.
+"""Arrays whose numbers are those of a program, in the place of numpy's, and numpy's ufuncs over them.
 
-An array is a table of places in a buffer, one column of expressions. Numpy changes the order and the shape of the
+An array is a table of places in a buffer, which is a node of a program. Numpy changes the order and the shape of the
 table as it would those of the array, so that views, slices and broadcasting are numpy's own; writing to a view changes
-the buffer that it shares. A buffer holds plain numbers until an expression is written to it, and such an array can be
+the buffer that it shares. A buffer holds plain numbers until others are written to it, and such an array can be
 used wherever numpy wants numbers.
 """
 
@@ -13,33 +13,43 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from types import SimpleNamespace
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
-import casadi
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-Expression: TypeAlias = Any  # casadi.MX
-Places: TypeAlias = npt.NDArray[np.intp]
-Operation = Callable[..., Expression]
+from servobench.fmus.controllers.program import (
+    CALL,
+    JOIN,
+    MAP,
+    PUT,
+    REDUCE,
+    Node,
+    Operand,
+    Places,
+    computed,
+    numbers,
+    operand,
+)
+
 DTYPES = {"b": np.dtype(np.bool_), "i": np.dtype(np.int_), "f": np.dtype(np.float64)}
 
 
 class NotTraceable(ValueError):
-    """Code cannot be recorded: it decides by a number of the run, or calls a function that has no expression."""
+    """Code cannot be recorded: it decides by a number of the run, or calls a function that has no exported form."""
 
 
 @dataclass(eq=False)
 class Buffer:
-    """Numbers or expressions, which arrays share."""
+    """Numbers, plain ones or those of a program, which arrays share."""
 
-    content: Any  # (N,) numbers, or an expression (N, 1)
+    content: Any  # (N,) numbers, or a `Node` of N entries
 
 
 @dataclass(eq=False)
 class Traced(NDArrayOperatorsMixin):
-    """An array of expressions."""
+    """An array whose numbers a program computes, or plain ones."""
 
     buffer: Buffer  # holds its numbers
     places: Places  # positions of its entries in the buffer
@@ -49,13 +59,13 @@ class Traced(NDArrayOperatorsMixin):
     flags: ClassVar[SimpleNamespace] = SimpleNamespace(writeable=True)
 
     @classmethod
-    def of(cls, expression: Expression, shape: tuple[int, ...], kind: str = "f") -> Traced:
-        """Return the array (shape) of an expression (N, 1), in row-major order."""
-        return cls(Buffer(expression), np.arange(expression.numel()).reshape(shape), kind)
+    def of(cls, node: Node, shape: tuple[int, ...], kind: str = "f") -> Traced:
+        """Return the array (shape) of a node, in row-major order."""
+        return cls(Buffer(node), np.arange(node.size).reshape(shape), kind)
 
     @classmethod
     def plain(cls, numbers: npt.NDArray[Any]) -> Traced:
-        """Return an array of numbers to which expressions can be written."""
+        """Return an array of numbers to which those of a program can be written."""
         kind = numbers.dtype.kind if numbers.dtype.kind in DTYPES else "f"
         buffer = Buffer(np.array(numbers, dtype=np.float64).reshape(-1))
         return cls(buffer, np.arange(numbers.size).reshape(numbers.shape), kind)
@@ -69,32 +79,28 @@ class Traced(NDArrayOperatorsMixin):
         """Return the numbers of a constant array.
 
         Raises:
-            NotTraceable: it has expressions.
+            NotTraceable: a program computes them.
         """
         if not self.constant:
             raise NotTraceable("it decides by a number that is known in the run only")
         values: npt.NDArray[Any] = self.buffer.content[self.places]
         return values.astype(DTYPES[self.kind])
 
-    def flat(self) -> Expression:
-        """Return its entries as an expression (size, 1), in row-major order."""
-        content = self.buffer.content
-        places = self.places.reshape(-1)
+    def operand(self, shape: tuple[int, ...] | None = None) -> Operand:
+        """Return its entries, or those of a shape to which they are broadcast, as an operand."""
+        node = self.buffer.content
         if self.constant:
-            return casadi.MX(casadi.DM(content[places]))
-        if places.size == content.numel() and np.array_equal(places, np.arange(places.size)):
-            return content
-        if content.numel() == 1:
-            return casadi.repmat(content, places.size, 1)
-        if places.size == 0:
-            return casadi.MX(0, 1)
-        return content.nz[places.tolist()]
+            node = numbers(node)
+        places = self.places
+        if shape is not None:
+            places = np.broadcast_to(places, shape)
+        return operand(node, places)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:  # noqa: ANN401
-        """Carry out a ufunc, or a reduction by one, with at least one array of expressions.
+        """Carry out a ufunc, or a reduction by one, with at least one traced array.
 
         Raises:
-            NotTraceable: it has no expression.
+            NotTraceable: it has no exported form.
         """
         outputs = options.pop("out", None)
         options.pop("dtype", None)
@@ -164,13 +170,14 @@ class Traced(NDArrayOperatorsMixin):
             self.buffer.content = self.buffer.content.copy()
             self.buffer.content[places] = as_numbers(value)
         else:
-            before = self.buffer.content
-            if self.constant:
-                before = casadi.DM(before)
-            content = casadi.MX(before)
-            values = spread(as_traced(value), places.shape)
-            content.nz[places.reshape(-1).tolist()] = values.flat()
-            self.buffer.content = content
+            whole = np.arange(self.entries)
+            values = as_traced(value).operand(places.shape)
+            if np.array_equal(places.reshape(-1), whole):
+                self.buffer.content = computed(JOIN, [values], whole.shape, ())
+            else:
+                before = Traced(self.buffer, whole).operand()
+                targets = tuple(places.reshape(-1).tolist())
+                self.buffer.content = computed(PUT, (before, values), whole.shape, targets)
 
     def arranged(self, places: Places) -> Traced:
         """Return a view with another table of places."""
@@ -180,7 +187,8 @@ class Traced(NDArrayOperatorsMixin):
         """Return a copy with a buffer of its own."""
         if self.constant:
             return Traced.plain(self.numbers())
-        return Traced.of(self.flat(), self.shape, self.kind)
+        node = computed(JOIN, [self.operand()], (self.size,), ())
+        return Traced.of(node, self.shape, self.kind)
 
     def astype(self, dtype: npt.DTypeLike) -> Traced:
         """Return the numbers as another type; numbers are truncated to whole ones."""
@@ -198,6 +206,11 @@ class Traced(NDArrayOperatorsMixin):
     def tobytes(self) -> bytes:
         """Return bytes that equal those of no other array, so that a memo of it is never used for another one."""
         return b"traced %d %d" % (id(self), next(_COUNTER))
+
+    @property
+    def entries(self) -> int:
+        """Number of entries of its buffer."""
+        return int(self.buffer.content.size)
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -243,7 +256,7 @@ def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
 
 
 def as_traced(value: Any) -> Traced:  # noqa: ANN401 - anything array-like
-    """Return anything array-like as an array of expressions."""
+    """Return anything array-like as a traced array."""
     if isinstance(value, Traced):
         return value
     return Traced.plain(np.asarray(value))
@@ -254,11 +267,11 @@ def picked(array: Any, index: Traced) -> Traced:  # noqa: ANN401 - any array
     table = as_traced(array)
     rest = table.shape[1:]
     width = int(np.prod(rest))
-    # A row of the table has `width` places, the first of which is at width × index.
-    first = casadi.vec(casadi.repmat(width * index.flat().T, width, 1))
-    along = np.tile(np.arange(width, dtype=np.float64), index.size)
-    entries = table.flat().nz[first + casadi.DM(along)]
-    return Traced.of(entries, (*index.shape, *rest), table.kind)
+    sizes = (index.size, width)
+    node = computed(
+        CALL, (table.operand(), index.operand()), (index.size * width,), ("pick", *sizes)
+    )
+    return Traced.of(node, (*index.shape, *rest), table.kind)
 
 
 def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> Traced:
@@ -270,39 +283,35 @@ def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> 
         tables.append(first + np.arange(part.size).reshape(part.shape))
         first += part.size
     kind = max((part.kind for part in parts), key="bif".index)
-    content = casadi.vertcat(*(part.flat() for part in parts))
-    return Traced(Buffer(content), arrange(tables), kind)
+    operands = [part.operand() for part in parts]
+    arranged = arrange(tables)
+    if arranged.size != first:
+        return Traced(Buffer(computed(JOIN, operands, (first,), ())), arranged, kind)
+    order = arranged.reshape(-1)
+    detail = () if np.array_equal(order, np.arange(first)) else tuple(order.tolist())
+    return Traced.of(computed(JOIN, operands, (first,), detail), arranged.shape, kind)
 
 
-MAX_FLOAT = float(np.finfo(np.float64).max)
-
-
-def _rounded(x: Expression) -> Expression:
-    """Return the nearest whole number; ties go to the even one."""
-    nearest = casadi.floor(x + 0.5)
-    halfway = nearest - x == 0.5
-    odd = casadi.fmod(nearest, 2.0) != 0.0
-    return nearest - casadi.logic_and(halfway, odd)
-
-
-ARITHMETIC: Mapping[str, Operation] = {
-    "add": lambda x, y: x + y, "subtract": lambda x, y: x - y, "multiply": lambda x, y: x * y,
-    "divide": lambda x, y: x / y, "power": lambda x, y: x**y, "negative": lambda x: -x, "positive": lambda x: x,
-    "absolute": casadi.fabs, "fabs": casadi.fabs, "square": lambda x: x * x, "sqrt": casadi.sqrt, "exp": casadi.exp,
-    "expm1": casadi.expm1, "log": casadi.log, "log1p": casadi.log1p, "sin": casadi.sin, "cos": casadi.cos,
-    "tan": casadi.tan, "arcsin": casadi.asin, "arccos": casadi.acos, "arctan": casadi.atan, "arctan2": casadi.atan2,
-    "sinh": casadi.sinh, "cosh": casadi.cosh, "tanh": casadi.tanh, "hypot": casadi.hypot, "sign": casadi.sign,
-    "copysign": casadi.copysign, "floor": casadi.floor, "ceil": casadi.ceil, "rint": _rounded,
-    "maximum": casadi.fmax, "minimum": casadi.fmin, "remainder": lambda x, y: x - y * casadi.floor(x / y),
-    "floor_divide": lambda x, y: casadi.floor(x / y), "reciprocal": lambda x: 1.0 / x,
+# C of numpy's ufuncs; functions that C does not have are in `linear_algebra.h`.
+ARITHMETIC: Mapping[str, str] = {
+    "add": "({} + {})", "subtract": "({} - {})", "multiply": "({} * {})", "divide": "({} / {})",
+    "power": "pow({}, {})", "negative": "(-{})", "positive": "{}", "absolute": "fabs({})", "fabs": "fabs({})",
+    "square": "square({})", "sqrt": "sqrt({})", "exp": "exp({})", "expm1": "expm1({})", "log": "log({})",
+    "log1p": "log1p({})", "sin": "sin({})", "cos": "cos({})", "tan": "tan({})", "arcsin": "asin({})",
+    "arccos": "acos({})", "arctan": "atan({})", "arctan2": "atan2({}, {})", "sinh": "sinh({})", "cosh": "cosh({})",
+    "tanh": "tanh({})", "hypot": "hypot({}, {})", "sign": "sign({})", "copysign": "copysign({}, {})",
+    "floor": "floor({})", "ceil": "ceil({})", "rint": "nearbyint({})", "maximum": "larger({}, {})",
+    "minimum": "smaller({}, {})", "remainder": "modulo({}, {})", "floor_divide": "floor({} / {})",
+    "reciprocal": "(1.0 / {})",
 }  # fmt: skip
-COMPARISONS: Mapping[str, Operation] = {
-    "less": lambda x, y: x < y, "less_equal": lambda x, y: x <= y, "greater": lambda x, y: x > y,
-    "greater_equal": lambda x, y: x >= y, "equal": lambda x, y: x == y, "not_equal": lambda x, y: x != y,
-    "logical_and": casadi.logic_and, "logical_or": casadi.logic_or, "logical_not": casadi.logic_not,
-    "isfinite": lambda x: casadi.fabs(x) <= MAX_FLOAT,
-    "isnan": lambda x: casadi.logic_not(casadi.fabs(x) <= np.inf),
+COMPARISONS: Mapping[str, str] = {
+    "less": "(double)({} < {})", "less_equal": "(double)({} <= {})", "greater": "(double)({} > {})",
+    "greater_equal": "(double)({} >= {})", "equal": "(double)({} == {})", "not_equal": "(double)({} != {})",
+    "logical_and": "(double)({} != 0.0 && {} != 0.0)", "logical_or": "(double)({} != 0.0 || {} != 0.0)",
+    "logical_not": "(double)({} == 0.0)", "isfinite": "(double)(fabs({}) <= DBL_MAX)",
+    "isnan": "(double)!(fabs({}) <= INFINITY)",
 }  # fmt: skip
+CHOICE = "({} != 0.0 ? {} : {})"
 # Operations on bits are logical ones on arrays of truth.
 LOGICAL_NAMES: Mapping[str, str] = {
     "bitwise_and": "logical_and",
@@ -357,24 +366,18 @@ def elementwise(name: str, *inputs: Any) -> Traced:  # noqa: ANN401 - anything a
     return mapped(ARITHMETIC[name], arrays, "i" if whole else "f")
 
 
-def mapped(operation: Operation, arrays: Sequence[Traced], kind: str) -> Traced:
-    """Return an operation, entry by entry, of arrays that are broadcast against each other."""
+def mapped(operation: str, arrays: Sequence[Traced], kind: str) -> Traced:
+    """Return an operation in C, entry by entry, of arrays that are broadcast against each other."""
     shape = np.broadcast_shapes(*(each.shape for each in arrays))
-    size = int(np.prod(shape))
-    if size == 0:
-        return Traced.of(casadi.MX(0, 1), shape, kind)
-    parts = [each.flat() if each.size == 1 else spread(each, shape).flat() for each in arrays]
-    result = operation(*parts)
-    if result.numel() != size:
-        result = casadi.repmat(result, size, 1)
-    return Traced.of(result, shape, kind)
+    operands = [each.operand(shape) for each in arrays]
+    return Traced.of(computed(MAP, operands, shape, operation), shape, kind)
 
 
 def choose(chosen: Any, one: Any, other: Any) -> Traced:  # noqa: ANN401 - anything array-like
     """Return `one` where chosen, else `other`."""
     arrays = [as_traced(each) for each in (chosen, one, other)]
     kind = max((each.kind for each in arrays[1:]), key="bif".index)
-    return mapped(casadi.if_else, arrays, kind)
+    return mapped(CHOICE, arrays, kind)
 
 
 def reduced(
@@ -392,36 +395,23 @@ def reduced(
     table = as_traced(array)
     axes = _axes_of(axis, table.ndim)
     kept = tuple(size for i, size in enumerate(table.shape) if i not in axes)
-    length = int(np.prod([table.shape[i] for i in axes]))
-    count = int(np.prod(kept))
-    # Rows of entries that are reduced to one each: the reduced axes are the last ones.
-    moved = np.moveaxis(table.places, axes, range(-len(axes), 0))
-    rows = table.arranged(moved.reshape(count, length))
+    # The reduced axes are the last ones.
+    rows = table.arranged(np.moveaxis(table.places, axes, range(-len(axes), 0)))
+    result = Traced.plain(np.full(kept, EMPTY_REDUCTIONS[name]))
+    if table.size:
+        result = Traced.of(computed(REDUCE, [rows.operand()], kept, name), kept)
     logical = name.startswith("logical")
-    operation = ARITHMETIC.get(name) or COMPARISONS[name]
-    result: Expression
-    if length == 0:
-        result = casadi.MX(casadi.DM(np.full(count, EMPTY_REDUCTIONS[name])))
-    elif name == "add":
-        columns = casadi.reshape(rows.flat(), length, count)
-        result = casadi.vec(casadi.sum1(columns))
-    else:
-        result = rows[:, 0].flat()
-        for j in range(1, length):
-            result = operation(result, rows[:, j].flat())
-    if logical and length == 1:
-        result = result != 0.0
     if initial is not None:
-        result = operation(result, float(initial))
+        result = elementwise(name, result, float(initial))
     kind = "f"
     if logical:
         kind = "b"
     elif table.kind in "bi":
         kind = "i"
-    shape = kept
+    result.kind = kind
     if keepdims:
-        shape = tuple(1 if i in axes else size for i, size in enumerate(table.shape))
-    return Traced.of(result, shape, kind)
+        return np.expand_dims(result, axes)  # type: ignore[return-value]
+    return result
 
 
 def _axes_of(axis: int | Sequence[int] | None, ndim: int) -> tuple[int, ...]:
@@ -438,31 +428,14 @@ def matmul(a: Traced, b: Traced) -> Traced:
         return matmul(a[None, :], b)[..., 0, :]
     if b.ndim == 1:
         return matmul(a, b[:, None])[..., 0]
-    i, k = a.shape[-2:]
-    j = b.shape[-1]
-    if b.shape[-2] != k:
+    if b.shape[-2] != a.shape[-1]:
         raise ValueError(f"matmul: {a.shape} does not fit {b.shape}")
-    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    left = spread(a, (*lead, i, k)).reshape(-1, i, k)
-    right = spread(b, (*lead, k, j)).reshape(-1, k, j)
-    shape = (*lead, i, j)
-    if 0 in (i, j, k) or len(left) == 0:
-        zeros = casadi.MX.zeros(int(np.prod(shape)), 1)
-        return Traced.of(zeros, shape)
-    products = []
-    for A, B in zip(left, right, strict=True):
-        # Row-major entries are the column-major ones of the transpose, and (A B)ᵀ = Bᵀ Aᵀ.
-        B_transposed = casadi.reshape(B.flat(), j, k)
-        A_transposed = casadi.reshape(A.flat(), k, i)
-        product = casadi.mtimes(B_transposed, A_transposed)
-        products.append(casadi.vec(product))
-    return Traced.of(casadi.vertcat(*products), shape)
+    products = elementwise("multiply", a[..., :, None, :], b.mT[..., None, :, :])
+    return reduced("add", products, axis=-1)
 
 
 def vecdot(a: Traced, b: Traced) -> Traced:
     """Return a·b over the last axis, (...)."""
-    if a.ndim == 1 == b.ndim:
-        return Traced.of(casadi.dot(a.flat(), b.flat()), ())
     return reduced("add", elementwise("multiply", a, b), axis=-1)
 
 

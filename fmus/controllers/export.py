@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -12,7 +11,6 @@ from servobench.fmus.controllers.record import Recorded
 from servobench.fmus.model_description import Description, sampled_sections
 from servobench.fmus.product import Product, c_files, documentation, word
 from servobench.fmus.reference import tables
-from servobench.fmus.sources import generated_source
 from servobench.fmus.variables import INPUT, SAMPLED, Group, Layout
 from servobench.plant.contract.checks import FloatArray
 
@@ -88,11 +86,6 @@ class ControllerModel:
         """Name of the libraries."""
         return word(self.name, "controller")
 
-    @cached_property
-    def source(self) -> str:
-        """The generated C file."""
-        return generated_source(CORE, (self.recorded.start, self.recorded.step))
-
     def product(self, fmi_version: int, start: Mapping[str, FloatArray] | None = None) -> Product:
         """Return the content of the FMU.
 
@@ -106,7 +99,7 @@ class ControllerModel:
             fmi_version=fmi_version,
             folder=MODEL,
             core=CORE,
-            source=self.source,
+            source=self.recorded.source,
             constants=self._constants(layout),
             description=Description(
                 model_name=f"Controller {self.name}",
@@ -132,17 +125,12 @@ class ControllerModel:
         )
 
     def _constants(self, layout: Layout) -> dict[str, float]:
-        """Return the sizes of arrays and work space, and the codes, that the C model needs."""
-        parts = (self.recorded.start, self.recorded.step)
-        pointers = [size for part in parts for size in (part.sz_arg(), part.sz_res())]
+        """Return the sizes of arrays, and the codes, that the C model needs."""
         return {
             "PERIOD": self.period,
             "N_MEMORY": max(self.recorded.states, 1),
             "N_FEATURES": layout.by_name[SEEN].size,
             "N_ANSWERS": sum(group.size for group in layout.of_role(SAMPLED)),
-            "N_POINTERS": max(pointers),
-            "N_WORK": max(1, *(part.sz_w() for part in parts)),
-            "N_WHOLE_WORK": max(1, *(part.sz_iw() for part in parts)),
             "FAULT_NOT_DEFINITE": NOT_DEFINITE,
         }
 

@@ -1,18 +1,14 @@
-"""Numpy's functions other than ufuncs over arrays of expressions: arrangement, choice, sums, linear algebra.
+"""Numpy's functions other than ufuncs over traced arrays: arrangement, choice, sums, linear algebra.
 
-Linear algebra works matrix by matrix; a matrix that LAPACK would refuse is noted as a fault.
+Linear algebra is that of `linear_algebra.h`; a matrix that LAPACK would refuse is noted as a fault.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from itertools import combinations
 from typing import Any, Final, NamedTuple
 
-import casadi
 import numpy as np
 
 from servobench.fmus.controllers.arrays import (
-    Expression,
     NotTraceable,
     Traced,
     as_numbers,
@@ -21,12 +17,10 @@ from servobench.fmus.controllers.arrays import (
     elementwise,
     joined,
     reduced,
-    spread,
 )
 from servobench.fmus.controllers.branches import NOT_DEFINITE, note_fault
+from servobench.fmus.controllers.program import CALL, computed
 
-# Sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors.
-SWEEPS: Final = 10
 ARRANGES: Final = frozenset(
     {
         np.reshape, np.swapaxes, np.moveaxis, np.transpose, np.diagonal, np.repeat, np.broadcast_to, np.flip,
@@ -39,12 +33,12 @@ ARRANGES: Final = frozenset(
 def carry_out(
     function: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:  # noqa: ANN401
-    """Carry out a function of numpy with at least one array of expressions among its arguments.
+    """Carry out a function of numpy with at least one traced array among its arguments.
 
     Raises:
-        NotTraceable: it has no expression.
+        NotTraceable: it has no exported form.
     """
-    if not _has_expressions([arguments, options]):
+    if not _is_computed([arguments, options]):
         plain_arguments = [as_numbers(value) for value in arguments]
         plain_options = {name: as_numbers(value) for name, value in options.items()}
         return function(*plain_arguments, **plain_options)
@@ -58,13 +52,13 @@ def carry_out(
     return FUNCTIONS[function](*arguments, **options)
 
 
-def _has_expressions(value: Any) -> bool:  # noqa: ANN401 - any tree
+def _is_computed(value: Any) -> bool:  # noqa: ANN401 - any tree
     if isinstance(value, Traced):
         return not value.constant
     if isinstance(value, Mapping):
-        return any(_has_expressions(each) for each in value.values())
+        return any(_is_computed(each) for each in value.values())
     if isinstance(value, (list, tuple)):
-        return any(_has_expressions(each) for each in value)
+        return any(_is_computed(each) for each in value)
     return False
 
 
@@ -105,21 +99,10 @@ def _last_axis(array: Any, axis: int | None) -> Traced:  # noqa: ANN401 - as num
     return as_traced(np.moveaxis(array, axis, -1))
 
 
-def _extreme(name: str) -> Callable[..., Traced]:
-    """Return the function that finds the first entry along an axis that none exceeds by a comparison of its name."""
-
-    def find(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
-        rows = _last_axis(array, axis)
-        best = rows[..., 0]
-        place = Traced.plain(np.zeros(rows.shape[:-1], dtype=np.int_))
-        for k in range(1, rows.shape[-1]):
-            exceeds = elementwise(name, rows[..., k], best)
-            best = choose(exceeds, rows[..., k], best)
-            place = choose(exceeds, k, place)
-        place.kind = "i"
-        return place
-
-    return find
+def _argmax(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
+    place = call("place_of_largest", 1, _last_axis(array, axis)[..., None])[..., 0]
+    place.kind = "i"
+    return place
 
 
 def _cumsum(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
@@ -203,34 +186,18 @@ def _where(condition: Any, *values: Any) -> Traced:  # noqa: ANN401 - as numpy's
     return choose(condition, *values)
 
 
-def each_matrix(function: Callable[..., tuple[Any, ...]], *arrays: Traced) -> list[Traced]:
-    """Apply a function of CasADi's matrices to each matrix of stacks, and return the stacks of its results.
+def call(name: str, result: int, *arrays: Traced) -> Traced:
+    """Return the results, (..., result), of a function of `linear_algebra.h` for each matrix of stacks.
 
     Args:
-        function: of expressions (m, n), which returns some.
-        arrays: (..., m, n).
+        name: of the function.
+        result: size of what it writes.
+        arrays: (..., m, n), its arguments; it gets the sizes of the last one.
     """
     lead = np.broadcast_shapes(*(array.shape[:-2] for array in arrays))
-    stacks = []
-    for array in arrays:
-        sizes = array.shape[-2:]
-        stacks.append(spread(array, (*lead, *sizes)).reshape(-1, *sizes))
-    results = []
-    for matrices in zip(*stacks, strict=True):
-        arguments = [_matrix(each) for each in matrices]
-        results.append(function(*arguments))
-    # One stack of matrices for each of the results of a call.
-    joined_results = []
-    for matrices in zip(*results, strict=True):
-        column = casadi.vertcat(*(casadi.vec(each.T) for each in matrices))
-        joined_results.append(Traced.of(column, (*lead, *matrices[0].shape)))
-    return joined_results
-
-
-def _matrix(array: Traced) -> Expression:
-    """Return an array (m, n) as a matrix of CasADi, which counts entries column by column."""
-    rows, columns = array.shape
-    return casadi.reshape(array.flat(), columns, rows).T
+    operands = [array.operand((*lead, *array.shape[-2:])) for array in arrays]
+    shape = (*lead, result)
+    return Traced.of(computed(CALL, operands, shape, (name, *arrays[-1].shape[-2:])), shape)
 
 
 def solve(A: Any, b: Any) -> Traced:  # noqa: ANN401 - anything array-like
@@ -239,7 +206,10 @@ def solve(A: Any, b: Any) -> Traced:  # noqa: ANN401 - anything array-like
     right = as_traced(b)
     if right.ndim == 1:
         return solve(left, right[:, None])[..., 0]
-    return each_matrix(lambda one, other: (casadi.solve(one, other, "qr"),), left, right)[0]
+    n, k = right.shape[-2:]
+    solution = call("solve", n * k, left, right)
+    stack: Traced = solution.reshape((*solution.shape[:-1], n, k))
+    return stack
 
 
 def inverse(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
@@ -250,45 +220,18 @@ def inverse(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
 def cholesky(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
     """Return the lower factor, (..., n, n); a matrix that is not positive definite is a fault."""
     table = as_traced(A)
-    factor = _cholesky(table.shape[-1])
-    roots, least = each_matrix(factor, table)
+    entries = int(np.prod(table.shape[-2:]))
+    factor = call("cholesky", entries + 1, table)
     # A pivot that is NaN is not positive, either.
-    definite = elementwise("greater", least, 0.0)
+    definite = elementwise("greater", factor[..., entries], 0.0)
     note_fault(elementwise("logical_not", definite), NOT_DEFINITE)
-    return roots
-
-
-@cache
-def _cholesky(size: int) -> Any:  # noqa: ANN401 - a function of CasADi
-    """Return the function that gives L and the least pivot; NaN where there is none."""
-    A = casadi.SX.sym("A", size, size)
-    L = casadi.SX.zeros(size, size)
-    least = casadi.SX(np.inf)
-    for j in range(size):
-        pivot = A[j, j]
-        if j > 0:
-            pivot = pivot - casadi.sumsqr(L[j, :j])
-        # A pivot that is NaN compares false with everything, and becomes the least one.
-        not_smaller = casadi.if_else(pivot >= least, least, pivot)
-        least = casadi.if_else(pivot < least, pivot, not_smaller)
-        L[j, j] = casadi.sqrt(pivot)
-        for i in range(j + 1, size):
-            eliminated = casadi.dot(L[i, :j], L[j, :j]) if j else 0.0
-            L[i, j] = (A[i, j] - eliminated) / L[j, j]
-    return casadi.Function(f"cholesky_{size}", [A], [casadi.densify(L), least])
+    root: Traced = factor[..., :entries].reshape(table.shape)
+    return root
 
 
 def determinant(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
     """Return the determinants, (...), as the products of eliminated pivots."""
-    table = as_traced(A)
-    function = _determinant(table.shape[-1])
-    return each_matrix(lambda one: (function(one),), table)[0][..., 0, 0]
-
-
-@cache
-def _determinant(size: int) -> Any:  # noqa: ANN401 - a function of CasADi
-    A = casadi.SX.sym("A", size, size)
-    return casadi.Function(f"determinant_{size}", [A], [casadi.det(A)])
+    return call("determinant", 1, as_traced(A))[..., 0]
 
 
 class Svd(NamedTuple):
@@ -311,84 +254,22 @@ def svd(a: Any, full_matrices: bool = True, compute_uv: bool = True) -> Svd | Tr
         raise NotTraceable(
             "it calls numpy.linalg.svd of a matrix that is not square without full_matrices=False"
         )
-    function = _svd(max(m, n), min(m, n))
-    if m >= n:
-        U, values, V = each_matrix(function, table)
-    else:
-        V, values, U = each_matrix(function, table.mT)
-    values = values[..., 0]
-    if compute_uv:
-        return Svd(U, values, V.mT)
-    return values
-
-
-@cache
-def _svd(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
-    """Return the function that gives U (rows, columns), singular values and V of a tall matrix."""
-    sweep = _sweep(rows, columns)
-    sort = _sorted(rows, columns)
-    A = casadi.MX.sym("A", rows, columns)
-    own = A
-    turned = casadi.MX(casadi.DM.eye(columns))
-    for _ in range(SWEEPS):
-        own, turned = sweep(own, casadi.densify(turned))
-    return casadi.Function(f"svd_{rows}_{columns}", [A], list(sort(own, turned)))
-
-
-def _sweep(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
-    """Return the function that rotates each pair of columns once, and those of V alike."""
-    A = casadi.SX.sym("A", rows, columns)
-    V = casadi.SX.sym("V", columns, columns)
-    own = casadi.horzsplit(A)
-    turned = casadi.horzsplit(V)
-    for p, q in combinations(range(columns), 2):
-        c, s = _rotation(own[p], own[q])
-        for part in (own, turned):
-            one = part[p]
-            other = part[q]
-            part[p] = c * one - s * other
-            part[q] = s * one + c * other
-    outputs = [casadi.horzcat(*own), casadi.horzcat(*turned)]
-    return casadi.Function(f"sweep_{rows}_{columns}", [A, V], outputs)
-
-
-def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
-    """Return the function that makes U, singular values and V of columns that are orthogonal."""
-    A = casadi.SX.sym("A", rows, columns)
-    V = casadi.SX.sym("V", columns, columns)
-    own = casadi.horzsplit(A)
-    turned = casadi.horzsplit(V)
-    sizes = [casadi.sqrt(casadi.sumsqr(column)) for column in own]
-    for p, q in combinations(range(columns), 2):
-        swapped = sizes[p] < sizes[q]
-        for part in (own, turned, sizes):
-            one = part[p]
-            other = part[q]
-            part[p] = casadi.if_else(swapped, other, one)
-            part[q] = casadi.if_else(swapped, one, other)
-    left = []
-    for column, size in zip(own, sizes, strict=True):
-        left.append(casadi.if_else(size > 0.0, column / size, 0.0))
-    if rows == columns == 3:
-        # U is orthogonal also where the least value is only a rounding error.
-        across = casadi.cross(left[0], left[1])
-        opposite = casadi.dot(across, left[2]) < 0.0
-        left[2] = casadi.if_else(opposite, -across, across)
-    factors = [casadi.horzcat(*left), casadi.vertcat(*sizes), casadi.horzcat(*turned)]
-    outputs = [casadi.densify(each) for each in factors]
-    return casadi.Function(f"sorted_{rows}_{columns}", [A, V], outputs)
-
-
-def _rotation(one: Expression, other: Expression) -> tuple[Expression, Expression]:
-    """Return cosine and sine of the rotation that makes two columns orthogonal."""
-    product = casadi.dot(one, other)
-    zeta = (casadi.sumsqr(other) - casadi.sumsqr(one)) / (2.0 * product)
-    # t = tan of the angle, the smaller root of t² + 2 ζ t − 1 = 0
-    sign = casadi.if_else(zeta >= 0.0, 1.0, -1.0)
-    t = sign / (casadi.fabs(zeta) + casadi.sqrt(1.0 + zeta * zeta))
-    t = casadi.if_else(product == 0.0, 0.0, t)
-    c = 1.0 / casadi.sqrt(1.0 + t * t)
-    return c, c * t
+    # The factors of the transpose are those of the matrix, in the opposite order.
+    wide = m < n
+    tall = table.mT if wide else table
+    rows, columns = tall.shape[-2:]
+    # Uᵀ, V and the singular values are columns of the result.
+    factors = call("svd", (rows + columns + 1) * columns, tall)
+    split = rows * columns
+    lead = factors.shape[:-1]
+    values = factors[..., split + columns * columns :]
+    if not compute_uv:
+        return values
+    U = factors[..., :split].reshape((*lead, columns, rows))
+    V = factors[..., split : split + columns * columns].reshape((*lead, columns, columns))
+    if wide:
+        return Svd(V.mT, values, U)
+    return Svd(U.mT, values, V)
 
 
 def pseudo_inverse(a: Any) -> Traced:  # noqa: ANN401 - anything array-like
@@ -408,7 +289,7 @@ FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
     np.zeros_like: _like(0.0), np.empty_like: _like(0.0), np.ones_like: _like(1.0), np.full_like: _full_like,
     np.sum: _reduction("add"), np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
     np.any: _reduction("logical_or"), np.all: _reduction("logical_and"),
-    np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum,
+    np.argmin: lambda array, axis=None: _argmax(-array, axis), np.argmax: _argmax, np.cumsum: _cumsum,
     np.clip: _clip, np.dot: _dot, np.cross: _cross, np.linalg.cross: _cross, np.einsum: _einsum,
     np.trace: lambda array, *axes, **named: reduced("add", np.diagonal(array, *axes, **named), axis=-1),
     np.count_nonzero: lambda array, axis=None: reduced("add", elementwise("not_equal", array, 0.0), axis),

@@ -1,36 +1,53 @@
-"""A system in discrete time as CasADi functions, recorded from a pure step of numpy code.
+"""A system in discrete time as C, recorded from a pure step of numpy code.
 
 Most of numpy asks its arguments for their implementation (`__array_ufunc__`, `__array_function__`). Functions that make
 arrays, the decisions of `plant.contract.lanes` and memos do not: while code is recorded, these names are replaced in
 all modules of this package but its FMUs.
 """
 
+import ctypes
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import _lru_cache_wrapper
+from functools import _lru_cache_wrapper, cached_property
 from math import prod
 from pathlib import Path
 from threading import RLock
 from traceback import walk_tb
 from typing import Any, Final, TypeAlias
 
-import casadi
 import numpy as np
+import numpy.typing as npt
 
+from servobench.fmus.compiler import compile_library, this_platform
 from servobench.fmus.controllers import branches
-from servobench.fmus.controllers.arrays import Expression, NotTraceable, Traced, as_traced, spread
-from servobench.fmus.controllers.branches import frame, leaves_of, symbols_like, with_leaves
+from servobench.fmus.controllers.arrays import (
+    DTYPES,
+    Buffer,
+    NotTraceable,
+    Traced,
+    as_traced,
+    spread,
+)
+from servobench.fmus.controllers.branches import leaves_of, with_leaves
+from servobench.fmus.controllers.emission import program
 from servobench.fmus.controllers.functions import carry_out
+from servobench.fmus.controllers.program import STORE, Node, add, block, source
+from servobench.fmus.product import committed
 from servobench.plant.contract import checks, lanes
+from servobench.plant.contract.checks import FloatArray
 
 Inputs: TypeAlias = Mapping[str, Any]
 Shapes: TypeAlias = Mapping[str, tuple[tuple[int, ...], str]]
 PACKAGE: Final = "servobench."
 OWN: Final = "servobench.fmus."
+HEADERS: Final = ("controller.h", "linear_algebra.h")
+# Numbers do not depend on the level of optimisation, and the functions are called from Python.
+CHECKED: Final = ("-O1", "-fvisibility=default")
 _LOCK = RLock()
 Traced.function = staticmethod(carry_out)
 
@@ -112,7 +129,7 @@ _MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Record numpy code of this package within the context: it computes with expressions."""
+    """Record numpy code of this package within the context: it computes with traced arrays."""
     changed = []
     meanings = {id(old): new for old, new in _MEANINGS}
     with _LOCK:
@@ -124,7 +141,7 @@ def recording() -> Iterator[None]:
                 for key, value in list(space.items()):
                     new = meanings.get(id(value))
                     if new is None and isinstance(value, _lru_cache_wrapper):
-                        new = value.__wrapped__  # A memo must not keep expressions.
+                        new = value.__wrapped__  # A memo must not keep traced arrays.
                     if new is not None:
                         changed.append((space, key, value))
                         space[key] = new
@@ -136,15 +153,44 @@ def recording() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A system x(0) = start(u), (x, y) ← step(x, u)."""
+    """A system x(0) = start(u), (x, y) ← step(x, u), as C.
 
-    start: Any  # CasADi function u -> x, code
-    step: Any  # CasADi function x, u -> x, y, code; a code that is not 0 is that of a fault, as in `branches`
+    It is compiled for this machine when it is called for the first time. Both functions return the code of a fault as
+    well, 0 for none.
+    """
 
-    @property
-    def states(self) -> int:
-        """Number of entries of the state."""
-        return int(self.start.numel_out(0))
+    source: str
+    states: int  # number of entries of the state
+    outputs: int
+
+    def start(self, u: npt.ArrayLike) -> tuple[FloatArray, float]:
+        """Return x and a code."""
+        return self._called("start", np.empty(self.states), u)[::2]
+
+    def step(self, x: npt.ArrayLike, u: npt.ArrayLike) -> tuple[FloatArray, FloatArray, float]:
+        """Return x, y and a code."""
+        return self._called("step", np.array(x, dtype=np.float64), u)
+
+    def _called(
+        self, name: str, x: FloatArray, u: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray, float]:
+        y = np.empty(self.outputs)
+        arrays = (x, np.ascontiguousarray(u, dtype=np.float64), y)
+        function = getattr(self._library, f"controller_{name}")
+        function.restype = ctypes.c_double
+        return x, y, function(*(ctypes.c_void_p(each.ctypes.data) for each in arrays))
+
+    @cached_property
+    def _library(self) -> ctypes.CDLL:
+        target = this_platform()
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
+            folder = Path(name)
+            for header in HEADERS:
+                (folder / header).write_text(committed("controller", header), encoding="utf-8")
+            (folder / "controller.c").write_text(self.source, encoding="utf-8")
+            library = folder / f"controller{target.suffix}"
+            compile_library(folder, ["controller.c"], target, library, CHECKED)
+            return ctypes.CDLL(str(library))
 
 
 def record(
@@ -156,7 +202,7 @@ def record(
     """Record a system.
 
     Args:
-        system: first argument of both functions; a copy of it is used, whose memos may keep expressions.
+        system: first argument of both functions; a copy of it is used, whose memos may keep traced arrays.
         start: system, inputs -> state, a tree of arrays.
         step: system, state, inputs -> new state of the same form, and the output.
         inputs: shape and kind of each, in the order of the columns of u.
@@ -172,64 +218,53 @@ def record(
         ) from error
     try:
         with recording():
-            values, u = _inputs(inputs)
-            with frame() as faults:
-                first = start(own, values)
-            outputs = [_column(first), faults.code]
-            begin = casadi.Function("controller_start", [u], outputs, {"cse": True})
-            return Recorded(begin, _recorded_step(own, step, inputs, first))
+            with block() as beginning:
+                tree = start(own, _inputs(inputs))
+                first = leaves_of(tree)
+                _store("x", first)
+            with block() as period:
+                x = source("x", sum(np.size(leaf) for leaf in first))
+                state, output = step(own, with_leaves(tree, _parts(x, first)), _inputs(inputs))
+                new = leaves_of(state)
+                _store("y", [output])
+                _store("x", new)
     except NotTraceable as error:
         raise NotTraceable(f"{_where_it_failed(error)}: {error}") from error
-    except RuntimeError as error:  # raised by CasADi
-        said = str(error).partition("\n")[0]
-        raise NotTraceable(
-            f"{_where_it_failed(error)}: CasADi cannot express it ({said})"
-        ) from error
-
-
-def _recorded_step(
-    system: Any,  # noqa: ANN401 - as `record`
-    step: Callable[[Any, Any, Inputs], tuple[Any, Any]],
-    inputs: Shapes,
-    first: Any,  # noqa: ANN401 - any tree
-) -> Any:  # noqa: ANN401 - a function of CasADi
-    """Return the function that computes a step from a state like the `first`."""
-    values, u = _inputs(inputs)
-    leaves = leaves_of(first)
-    symbols = symbols_like(leaves)
-    with frame() as faults:
-        state, output = step(system, with_leaves(first, symbols), values)
-    new = leaves_of(state)
-    if [np.shape(leaf) for leaf in new] != [np.shape(leaf) for leaf in leaves]:
+    if [np.shape(leaf) for leaf in new] != [np.shape(leaf) for leaf in first]:
         raise NotTraceable("its state has other sizes later than at the start")
-    # All arrays of the state become parts of one column x.
-    ends = np.cumsum([0, *(symbol.size for symbol in symbols)]).tolist()
-    x = casadi.MX.sym("x", ends[-1])
-    parts = casadi.vertsplit(x, ends)
-    results = [_column(state), as_traced(output).flat(), faults.code]
-    arrays = [symbol.buffer.content for symbol in symbols]
-    results = casadi.substitute(results, arrays, parts)
-    return casadi.Function("controller_step", [x, u], results, {"cse": True})
+    text = program({"controller_start": beginning, "controller_step": period})
+    return Recorded(text, x.size, np.size(output))
 
 
-def _inputs(inputs: Shapes) -> tuple[dict[str, Traced], Expression]:
-    """Return the inputs as arrays by name, and the column u of symbols that they are parts of."""
-    u = casadi.MX.sym("u", sum(prod(shape) for shape, _ in inputs.values()))
+def _inputs(inputs: Shapes) -> dict[str, Traced]:
+    """Return the inputs as arrays by name, which are parts of the column u."""
+    u = source("u", sum(prod(shape) for shape, _ in inputs.values()))
     values = {}
     first = 0
     for name, (shape, kind) in inputs.items():
-        end = first + prod(shape)
-        part = u[first:end]
-        if kind == "b":
-            part = part != 0.0
-        values[name] = Traced.of(part, shape, kind)
-        first = end
-    return values, u
+        part = Traced(Buffer(u), first + np.arange(prod(shape)).reshape(shape))
+        values[name] = part.astype(DTYPES[kind])
+        first += prod(shape)
+    return values
 
 
-def _column(tree: Any) -> Expression:  # noqa: ANN401 - any tree
-    """Return all arrays of a tree as one column."""
-    return casadi.vertcat(*(as_traced(leaf).flat() for leaf in leaves_of(tree)))
+def _parts(x: Node, leaves: Sequence[Any]) -> list[Traced]:
+    """Return arrays like some others as the parts of a column."""
+    found = []
+    first = 0
+    for leaf in leaves:
+        places = first + np.arange(np.size(leaf)).reshape(np.shape(leaf))
+        found.append(Traced(Buffer(x), places, leaf.dtype.kind))
+        first += places.size
+    return found
+
+
+def _store(name: str, leaves: Sequence[Any]) -> None:
+    """Record that arrays are written to a column one after the other."""
+    first = 0
+    for leaf in leaves:
+        add(STORE, [as_traced(leaf).operand()], (), (name, first))
+        first += np.size(leaf)
 
 
 def _where_it_failed(error: BaseException) -> str:

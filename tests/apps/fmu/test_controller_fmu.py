@@ -215,6 +215,6 @@ def test_a_network_that_magnifies_rounding_errors_equals_the_original_in_every_s
     for seen, reference, command in periods(run):
         if before is not None:
             _, output, _ = model.recorded.step(before, [seen.time, *inputs_of(seen, reference)])
-            differences.append(np.abs(np.asarray(output)[:N, 0] - command.joint_velocity).max())
+            differences.append(np.abs(output[:N] - command.joint_velocity).max())
         before = np.hstack([*map(np.ravel, leaves_of(run.controller.save()))])
     assert max(differences) < 1e-9
