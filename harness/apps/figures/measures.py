@@ -335,38 +335,6 @@ def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
     return edge
 
 
-def draw_places(axes: Axes, places: Sequence[float], values: Curves, styles: Styles) -> None:
-    """Draw an estimate with its interval for each method at each place (abscissae, ascending), marks shifted sideways.
-
-    An infinite estimate is left out, an infinite end of an interval leaves the picture.
-    """
-    width = SPREAD * (places[1] - places[0] if len(places) > 1 else 1.0)
-    for k, (name, estimates) in enumerate(values.items()):
-        style = styles[name]
-        shift = width * ((k + 0.5) / len(values) - 0.5)
-        x = np.array(places, dtype=float) + shift
-        y, low, high = _bounds(estimates)
-        known = np.isfinite(y)
-        if known.any():
-            y = y[known]
-            below = y - np.where(np.isfinite(low), low, np.nan)[known]
-            outside = 10.0 * (1.0 + float(np.max(y)))  # a number above the picture
-            above = np.where(np.isinf(high[known]), outside, high[known]) - y
-            axes.errorbar(
-                x[known],
-                y,
-                yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0),
-                color=style.colour,
-                linestyle="none",
-                marker=style.marker or "_",
-                markersize=4.5,
-                linewidth=1.2,
-                elinewidth=1.0,
-                capsize=2.0,
-                label=name,
-            )
-
-
 def _bounds(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the values of estimates and the ends of their intervals, (k,) each."""
     y = np.array([estimate.value for estimate in estimates])

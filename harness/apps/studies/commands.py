@@ -169,7 +169,7 @@ def claims(
         verdict = answer.verdict + reproduction.elsewhere(answer, answers)
         console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
-    say(f"answers in {out / reproduction.ANSWERS}, figures in {out / reproduction.FIGURES}")
+    say(f"answers in {out / reproduction.ANSWERS}")
     if wanted is not None:
         lines = reproduction.differences(answers, wanted)
         say("\n".join(lines) or f"the same answers as in {check}")

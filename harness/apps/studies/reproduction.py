@@ -1,4 +1,4 @@
-"""The reproduction of the paper: carry out its runs, answer its claims, write tables and figures."""
+"""The reproduction of the paper: carry out its runs, answer its claims, write tables."""
 
 import io
 import re
@@ -10,17 +10,11 @@ from typing import Final, TypeAlias
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import NO_ESTIMATE
-from servobench.harness.apps.figures.measures import draw_places
-from servobench.harness.apps.figures.style import figure_style, method_styles, save_figure
 from servobench.harness.apps.studies.claims import (
     MAIN,
     UNDECIDED,
     Answer,
-    Measurement,
     answer_all,
     studies,
 )
@@ -34,9 +28,6 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_text, write_atomically
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
-FIGURES: Final = "figures"
-READINGS = {"ε = 0": "reading_epsilon", "entries": "reading_entries"}  # claim -> name of its figure
-MAX_LABEL = 28  # characters of an ordinate's label on one line
 ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
 NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
@@ -58,7 +49,7 @@ def reproduce(
     """Carry out the runs and answer the claims.
 
     Args:
-        out: folder for runs, tables and figures.
+        out: folder for runs and tables.
         plants: names.
         robots: number of robots for each move; two fifths of them for the circle.
         how: how the runs are carried out.
@@ -94,65 +85,7 @@ def reproduce(
         write_tables(answers, out)
         write = partial(Path.write_text, data=markdown_table(answers), encoding="utf-8")
         write_atomically(out / "answers.md", write)
-        draw_answers(answers, out / FIGURES)
     return answers
-
-
-def draw_answers(answers: Sequence[Answer], folder: Path) -> None:
-    """Draw a figure for each claim, a column a plant and division, a row a measurement."""
-    for claim in dict.fromkeys(answer.claim for answer in answers):
-        with figure_style():
-            figure = _draw([answer for answer in answers if answer.claim == claim])
-        save_figure(figure, folder / READINGS.get(claim, f"claim_{claim}"))
-
-
-def _draw(answers: Sequence[Answer]) -> Figure:
-    panels = list(dict.fromkeys(m.panel for answer in answers for m in answer.measurements))
-    figure = Figure(figsize=(4.6 * len(answers), 2.6 * len(panels) + 0.6), layout="constrained")
-    grid = figure.subplots(len(panels), len(answers), squeeze=False, sharey="row")
-    for column, answer in enumerate(answers):
-        for row, panel in enumerate(panels):
-            measured = [m for m in answer.measurements if m.panel == panel]
-            _draw_panel(grid[row, column], measured)
-        grid[0, column].set_title(f"{answer.plant}, {answer.division}:\n{answer.verdict}")
-    for row, panel in enumerate(panels):
-        label = panel if len(panel) < MAX_LABEL else panel.replace(", ", ",\n", 1)
-        grid[row, 0].set_ylabel(label)
-    figure.suptitle(answers[0].title)
-    return figure
-
-
-def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
-    if not measured:
-        axes.set_axis_off()
-        return
-    places = list(dict.fromkeys(m.place for m in measured))
-    labels = list(dict.fromkeys(m.label for m in measured))
-    known = {(m.label, m.place): m.estimate for m in measured}
-    values = {
-        label: [known.get((label, place), NO_ESTIMATE) for place in places] for label in labels
-    }
-    draw_places(axes, range(len(places)), values, method_styles(labels))
-    axes.set_xticks(range(len(places)), places)
-    axes.set_xlim(-0.6, len(places) - 0.4)
-    panel = measured[0].panel
-    if "−" in panel:
-        _draw_alike(axes, 0.0)  # a difference
-    elif " over " in panel:
-        _draw_alike(axes, 1.0)  # a ratio
-    else:
-        ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
-        highest = float(np.max(ends[np.isfinite(ends)], initial=0.0))
-        axes.set_ylim(0.0, 1.15 * max(1e-9, highest))
-    axes.grid(visible=True, alpha=0.3)
-    handles, _ = axes.get_legend_handles_labels()
-    if handles:  # none where no run gives a number, as in moves too short to settle
-        axes.legend(fontsize=7, frameon=False)
-
-
-def _draw_alike(axes: Axes, level: float) -> None:
-    """Draw a line where two methods are alike."""
-    axes.axhline(level, color="black", linewidth=0.8)
 
 
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:
