@@ -27,10 +27,8 @@ from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND
 from servobench.plant.rendered import urdf
 
-START: Final = 1.0  # [s]
+UNTURNED: Final = np.eye(3)  # a rotation
 CAMERA: Final = "camera"  # frame: z along the optical axis, x right and y down in the image
-VALID: Final = "feature_valid"
-COMMANDS: Final = "forward_velocity_controller/commands"
 SIGNALS: Final = ("reference", "true_feature", "feature")
 GROUPS: Final = (COMMAND, "joint_position", *SIGNALS)  # kinds of columns
 MESH: Final = re.compile(r'<mesh filename="ball.obj" scale="(\S+) [^>]*>')
@@ -94,7 +92,8 @@ def write_bag(path: Path, steps: pd.DataFrame, run: Mapping[Any, Any]) -> None:
 
 
 def _nanoseconds(time: float) -> int:
-    return round((START + time) * 1e9)
+    """Return a time of the run [s] as a stamp, which begins at 1 s."""
+    return round((1.0 + time) * 1e9)
 
 
 def _header(time: float, frame: str) -> Message:
@@ -115,19 +114,22 @@ def _signals(row: Mapping[Hashable, float], captured: float) -> dict[str, Messag
     for name, value in row.items():
         column = str(name)
         kind = next((each for each in GROUPS if column.startswith(f"{each}_")), "")
-        if kind and column != VALID:
+        if kind and column != "feature_valid":
             groups[kind][column.removeprefix(f"{kind}_").removesuffix("_rad")] = value
         elif math.isfinite(value):
             messages[f"steps/{column}"] = {"data": value}
     speeds, joints, *places = groups.values()
     stamps = {"reference": time, "true_feature": time, "feature": captured}
     for (kind, stamp), place in zip(stamps.items(), places, strict=True):
-        if kind != "feature" or row[VALID]:
+        if kind != "feature" or row["feature_valid"]:
             point = _vector(place.values())
             messages[kind] = {"header": _header(stamp, CAMERA), "point": point}
     header = _header(time, urdf.BASE_LINK)
     state = {"header": header, "name": list(joints), "position": list(joints.values())}
-    return messages | {"joint_states": state, COMMANDS: {"data": list(speeds.values())}}
+    return messages | {
+        "joint_states": state,
+        "forward_velocity_controller/commands": {"data": list(speeds.values())},
+    }
 
 
 def _scene(shown: LoggedRun, k: int, time: float) -> dict[str, Message]:
@@ -141,8 +143,9 @@ def _scene(shown: LoggedRun, k: int, time: float) -> dict[str, Message]:
     measured = model.to_base(shown.track.vectors("feature_")[k])
     edges = [
         ((urdf.BASE_LINK, CAMERA), model.X_BC[:3, 3], model.X_BC[:3, :3]),
-        ((urdf.BASE_LINK, "measured"), measured, np.eye(3)),
-        ((urdf.BASE_LINK, "reference"), shown.reference[k], np.eye(3)),
+        ((urdf.FLANGE_LINK, urdf.BALL_LINK), model.arm.tool, UNTURNED),
+        ((urdf.BASE_LINK, "measured"), measured, UNTURNED),
+        ((urdf.BASE_LINK, "reference"), shown.reference[k], UNTURNED),
     ]
     for edge, (before, frame) in zip(pairwise(links), pairwise(frames), strict=True):
         step = np.linalg.inv(before) @ frame
