@@ -120,7 +120,8 @@ def test_pfdl_begins_anew_where_its_jacobian_has_turned_away():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CLASSES)
 def test_a_rival_keeps_the_contract_of_controllers(name):
-    assert servobench.check_controller(f"{FOLDER / name}.py:{CLASSES[name]}").ok
+    place = f"{FOLDER / name}.py:{CLASSES[name]}"
+    assert servobench.check_controller(f"contract_{name}={place}").ok
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -84,7 +84,7 @@ WRONG = (
     ("mine.py:endless", "endless must return a finite number or NaN, got inf (mine.py:"),
     ("mine.py:unknown", "--metric mine.py:unknown: unknown is NaN in every run"),
     ("mine.py:exits", "it ended the process with exit code 3; raise an error instead"),
-    ("mine.py:hangs", "mine.py:44: no answer after 4 s; is there a loop without an end"),
+    ("mine.py:hangs", ": no answer after 4 s; is there a loop without an end"),
     ("mine.py:overshoot", "has a column overshoot already; give yours another name, such as my_ov"),
     ("mine.py:plain", "plain is the function plain, wanted a function below @servobench.metric("),
     ("mine.py:ita", "mine.py has no 'ita': did you mean 'itae'?"),
