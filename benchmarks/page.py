@@ -21,6 +21,8 @@ import sys
 import time
 from pathlib import Path
 
+from threadpoolctl import threadpool_info
+
 import measuring
 from servobench.harness.config.installation import installed_version
 
@@ -56,8 +58,14 @@ def machine() -> str:
     return (
         f"Machine: {next(names, platform.machine())}, {os.cpu_count()} processors, {platform.system()} "
         f"{platform.machine()}; {datetime.datetime.now(tz=datetime.UTC):%Y-%m-%d}.\n"
-        + ", ".join(f"{name} {found}" for name, found in versions.items() if found) + "."
+        + ", ".join(f"{name} {found}" for name, found in versions.items() if found) + ".\n"
+        + "; ".join(dict.fromkeys(map(blas, threadpool_info()))) + "."
     )  # fmt: skip
+
+
+def blas(library: dict[str, object]) -> str:
+    """Return the name, version and kernel of a library of linear algebra."""
+    return f"{library['internal_api']} {library['version']}, kernel {library.get('architecture', 'unknown')}"
 
 
 def main() -> None:
@@ -78,6 +86,7 @@ def main() -> None:
         each: ["--picture", f"{pictures}/performance_{each}.png"] for each in ("shares", "scaling")
     }
     extra["throughput"] = ["--against", *options.against]
+    extra["waits"] = ["--against", *options.against]
     kept, failed = (options.out if options.quick else ROOT / "build") / "benchmarks", []
     kept.mkdir(parents=True, exist_ok=True)
 

@@ -1,0 +1,107 @@
+"""What a user waits for: seconds by the wall clock of whole commands, with all processors, beside older checkouts.
+
+    python benchmarks/waits.py                                  # this checkout
+    python benchmarks/waits.py --against before=/path/to/it     # a checkout with an environment in .venv, in turn
+
+Each command runs once to fill caches and is timed then. A command that a checkout does not know is a dash. Close other
+programs: they double these times.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+from measuring import QUICK, options, table
+
+HERE = Path(__file__).resolve().parents[1]
+EQUIPPED = "regression_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
+LOG = "log"  # folder of the run that is identified
+COMMANDS: dict[str, str] = {
+    "first run, its table": "run --plant kinematic --no-figures --out {out}",
+    "first run, with figures": "run --plant kinematic --out {out}",
+    "list of controllers": "controllers",
+    "sweep, five equipped methods × 1,000 robots": (
+        f"sweep --plants kinematic --controllers {EQUIPPED} --seeds {{robots}} --out {{out}}"
+    ),
+    "sweep, 100 rendered runs": (
+        "sweep --plants bullet --controllers ukf_mfac --tasks exp2 --seeds {rendered} --out {out}"
+    ),
+    "suite, three challenges, one method × 20 robots": (
+        "suite --plants kinematic --challenges severe,gears50,zeros90 --controllers regression_mfac "
+        "--seeds {few} --out {out}"
+    ),
+    "tune, one method × 10 trials": "tune --controllers ukf_mfac --trials {trials} --out {out}",
+    "identify, one log": f"identify {LOG} --out {{out}}.toml",
+    "export of an equipped controller as FMU": "fmu export --controller regression_mfac -o {out}.fmu",
+}
+ALL = {"robots": 1000, "rendered": 100, "few": 20, "trials": 10}
+FEW = {"robots": 2, "rendered": 1, "few": 1, "trials": 1}
+LOGGED = f"run --plant kinematic --controller {HERE}/docs/examples/excite.py --task circle --no-figures --out {LOG}"
+
+
+def seconds(checkout: Path, command: str, folder: Path) -> float | None:
+    """Return the wall-clock time of a command of a checkout [s], None if it fails."""
+    program = checkout / ".venv" / "bin" / "servobench"
+    began = time.perf_counter()
+    done = subprocess.run([program, *command.split()], cwd=folder, capture_output=True, check=False)
+    if done.returncode:
+        return None
+    return time.perf_counter() - began
+
+
+def first_commands(checkout: Path) -> list[str]:
+    """Return the commands of `make run` of a checkout."""
+    made = subprocess.run(
+        ["make", "--dry-run", "run"], cwd=checkout, capture_output=True, text=True, check=True
+    )
+    lines = made.stdout.replace("\\\n", " ").splitlines()
+    program = ".venv/bin/servobench "
+    return [line.removeprefix(program) for line in lines if line.startswith(program)]
+
+
+def shown(time_taken: float | None) -> str:
+    """Return a time [s] for the table."""
+    if time_taken is None:
+        return "–"
+    return f"{time_taken:.1f} s"
+
+
+def main() -> None:
+    """Print the table."""
+    given = options(
+        __doc__,
+        quick=QUICK,
+        against={"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"},
+    )
+    older = dict(each.split("=", 1) for each in given.against)
+    checkouts = {name: Path(path).resolve() for name, path in older.items()} | {"now": HERE}
+    sizes = FEW if given.quick else ALL
+    taken: dict[str, list[float | None]] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        seconds(HERE, LOGGED, folder)
+        for label, template in COMMANDS.items():
+            times = []
+            for name, checkout in checkouts.items():
+                for attempt in ("timed",) if given.quick else ("warm", "timed"):
+                    out = f"{name}_{len(taken)}_{attempt}"
+                    found = seconds(checkout, template.format(out=out, **sizes), folder)
+                times.append(found)
+            taken[label] = times
+        if not given.quick:
+            taken["`make run`, installed"] = [
+                sum(
+                    seconds(checkout, command, folder) or 0.0
+                    for command in first_commands(checkout)
+                )
+                for checkout in checkouts.values()
+            ]
+    rows = [[label, *map(shown, times)] for label, times in taken.items()]
+    print(table(["what", *checkouts], rows))
+
+
+if __name__ == "__main__":
+    main()
