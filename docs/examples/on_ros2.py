@@ -105,7 +105,7 @@ class Link:
         stamp = at.sec + 1e-9 * at.nanosec
         if stamp > self.stamps.get(topic, -np.inf):
             self.stamps[topic] = stamp
-            self.news[topic] = np.array(numbers)
+            self.news[topic] = np.where(np.isinf(numbers), np.nan, numbers)
             if self.ready:
                 self.came = self.stamps[JOINTS] if self.config.simulated else now
 
