@@ -335,8 +335,8 @@ def keep_guard(
     """
     for each in inherited:
         each.close()
-    # No exception, which a destructor would swallow
-    signal.signal(signal.SIGTERM, lambda *_: link.close())
+    # No exception, which a destructor would swallow; and the link stays open, as it may be about to be read
+    signal.signal(signal.SIGTERM, lambda *_: processes.hang_up(link.fileno()))
     processes.adopt_orphans()
     processes.keep_freed_memory()
     gc.freeze()  # so that runners go on sharing the memory of all imports
@@ -489,12 +489,12 @@ def _be_runner(
     link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int, guard: int
 ) -> None:
     """Be a runner: take tasks from the guard until it is gone."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     processes.lead_session()
     processes.end_with_parent(guard)
     for each in inherited:
         each.close()
     processes.forget_tracker()
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     # An interrupt has no effect here. It is not ignored, as programs started here would inherit that.
     signal.signal(signal.SIGINT, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_SETMASK, set())

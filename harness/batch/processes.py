@@ -202,6 +202,12 @@ def limit_silence(descriptor: int, seconds: int) -> None:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, pause)
 
 
+def hang_up(descriptor: int) -> None:
+    """Let both ends of a pipe of two directions, and all their copies, read its end."""
+    with socket.socket(fileno=os.dup(descriptor)) as end:
+        end.shutdown(socket.SHUT_RDWR)
+
+
 def _prctl(option: int, value: int) -> None:
     if LINUX:
         ctypes.CDLL(None).prctl(option, value, 0, 0, 0)

@@ -252,6 +252,31 @@ def test_a_call_returns_how_its_function_ended(how, end):
     assert multiprocessing.active_children() == []
 
 
+def guard_that_ends_as_it_reads(link) -> None:
+    read = link._recv
+
+    def read_too_late(*arguments: object) -> object:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return read(*arguments)
+
+    link._recv = read_too_late
+    isolation.keep_guard(link, Limits(), (), None)
+
+
+def test_a_guard_that_is_ended_just_before_it_reads_ends_in_silence(capfd):
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe()
+    guard = context.Process(target=guard_that_ends_as_it_reads, args=(theirs,))
+    guard.start()
+    theirs.close()
+    assert ours.recv_bytes() == isolation.ALIVE
+    guard.join(30.0)
+    assert guard.exitcode == 0
+    assert "Traceback" not in capfd.readouterr().err
+    with pytest.raises(EOFError):
+        ours.recv_bytes()
+
+
 def stop_for_ever(_, tell) -> None:
     tell(subprocess.Popen(["sleep", "60"], start_new_session=True).pid)
     time.sleep(0.5)  # the guard passes the answer on first
