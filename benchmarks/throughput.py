@@ -19,6 +19,9 @@ from typing import Any
 
 from measuring import METHODS, PERIODS, QUICK, microseconds, options, seeds, sweep_times, table
 
+COMPILED = "--compiled"
+EQUIPPED = ("regression_mfac", "rbf_pid", "rbfnn_mfac", "ukf_mpc")
+IN_C = ("regression_mfac", "ukf_mfac", "rbf_pid", "rbfnn_mfac", "ukf_mfac:published")
 HERE = Path(__file__).resolve().parents[1]
 ALONE = """
 import sys, time
@@ -32,7 +35,8 @@ except ImportError:
     from harness.run import run_experiment
 for seed in range(int(sys.argv[3]) + 1):
     began = began if seed > 1 else time.process_time()
-    run_experiment(RunRequest(sys.argv[1], sys.argv[2], "random", "moderate", seed), Settings())
+    in_c = {"run": {"compiled": True}} if "--compiled" in sys.argv else {}
+    run_experiment(RunRequest(sys.argv[1], sys.argv[2], "random", "moderate", seed), Settings(in_c))
 print(time.process_time() - began)
 """
 
@@ -52,7 +56,7 @@ def surroundings(checkout: Path) -> tuple[str, dict[str, Any]]:
 
 
 def sweep(
-    checkout: Path, plant: str, methods: str, robots: int, workers: int = 1
+    checkout: Path, plant: str, methods: str, robots: int, *further: str, workers: int = 1
 ) -> tuple[float, float]:
     """Return the processor time with all processes, and the wall-clock time, of a sweep [s]."""
     python, around = surroundings(checkout)
@@ -68,19 +72,21 @@ def sweep(
         "--workers",
         str(workers),
     )
-    return sweep_times([python, *names, "--seeds", seeds(robots)], **around)
+    return sweep_times([python, *names, "--seeds", seeds(robots), *further], **around)
 
 
-def period_in_sweep(checkout: Path, plant: str, method: str, few: int, many: int) -> float:
+def period_in_sweep(
+    checkout: Path, plant: str, method: str, few: int, many: int, *further: str
+) -> float:
     """Return the processor time of a period in a sweep [s]."""
-    times = [sweep(checkout, plant, method, count)[0] for count in (few, many)]
+    times = [sweep(checkout, plant, method, count, *further)[0] for count in (few, many)]
     return (times[1] - times[0]) / (many - few) / PERIODS
 
 
-def period_alone(checkout: Path, plant: str, method: str, runs: int) -> float:
+def period_alone(checkout: Path, plant: str, method: str, runs: int, *further: str) -> float:
     """Return the processor time of a period of a run by itself [s]."""
     python, around = surroundings(checkout)
-    command = [python, "-c", ALONE, plant, method, str(runs)]
+    command = [python, "-c", ALONE, plant, method, str(runs), *further]
     printed = subprocess.run(command, **around, capture_output=True, text=True, check=True).stdout
     return float(printed.split()[-1]) / runs / PERIODS
 
@@ -106,7 +112,7 @@ def main() -> None:
         name: Path(path).resolve()
         for name, _, path in (each.partition("=") for each in given.against)
     }
-    plants, methods = ["kinematic", "fmu"], list(METHODS)
+    plants, methods = ["kinematic", "fmu"], [*METHODS, *EQUIPPED]
     counts, old_counts, alone, rounds = (256, 1280), (4, 84), 15, given.rounds
     if given.quick:
         plants, methods, counts, old_counts, alone, rounds = (
@@ -123,6 +129,14 @@ def main() -> None:
             now = min(period_in_sweep(HERE, plant, method, *counts) for _ in range(rounds))
             single = min(period_alone(HERE, plant, method, alone) for _ in range(rounds))
             cells = [f"{1e6 * now:.1f} µs", f"{microseconds(single)} µs"]
+            if method in IN_C:
+                in_c = min(
+                    period_in_sweep(HERE, plant, method, *counts, COMPILED) for _ in range(rounds)
+                )
+                one = min(period_alone(HERE, plant, method, alone, COMPILED) for _ in range(rounds))
+                cells += [f"{1e6 * in_c:.1f} µs", f"{microseconds(one)} µs", f"{in_c / now:.2f}"]
+            else:
+                cells += ["–"] * 3
             for checkout in others.values():
                 cells.append(
                     f"**{ratio(period_in_sweep, now, checkout, plant, method, *old_counts)}**"
@@ -130,7 +144,8 @@ def main() -> None:
                 cells.append(ratio(period_alone, single, checkout, plant, method, alone))
             rows.append([plant, f"`{method}`", *cells])
     names = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]
-    print(table(["plant", "method", "in a sweep", "alone", *names], rows))
+    in_c_names = ("in C, in a sweep", "in C, alone", "in C / numpy, in a sweep")
+    print(table(["plant", "method", "in a sweep", "alone", *in_c_names, *names], rows))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ stages are the aids (`servobench.controllers.aids`). `Servo` is the pure composi
 `ServoController` holds the state of one run.
 """
 
-from typing import Any, NamedTuple, final
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 
@@ -55,7 +57,6 @@ class Stepped(NamedTuple):
     joint_velocity: FloatArray  # (..., n), rad/s
 
 
-@final
 class Servo:
     """Estimates the Jacobian from observed motions and commands with the estimate.
 
@@ -63,7 +64,14 @@ class Servo:
     Without aids joint positions are taken as read, so under camera latency Δy is that of a motion a little earlier:
     while the arm speeds up or slows down, this biases an estimator. While the initial Jacobian is probed, the probing
     moves are the command; estimator and law are not used.
+
+    Attributes:
+        faults: by lane, where the last step failed although it returned; here a step raises them instead.
+        states: type of its state.
     """
+
+    faults: Mapping[int, Exception] = MappingProxyType({})
+    states: type = ServoState
 
     def __init__(
         self,
@@ -382,6 +390,6 @@ class ServoController(Controller):
         Raises:
             TypeError: not such a state.
         """
-        if not isinstance(state, ServoState):
+        if not isinstance(state, self.servo.states):
             raise TypeError(f"state must come from save, got {type(state).__name__}")
-        self.state = state
+        self.state = cast(ServoState, state)

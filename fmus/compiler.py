@@ -138,6 +138,18 @@ def compile_library(
         raise CompilationFailed(f"{arguments[0]} failed for {target.name}: {first}")
 
 
+def describe_compiler(target: Platform) -> str:
+    """Return the first line with which the compiler for a platform introduces itself.
+
+    Raises:
+        CompilerMissing: none is installed.
+    """
+    done = subprocess.run(
+        [*_compiler(target), "--version"], capture_output=True, text=True, check=False
+    )
+    return done.stdout.partition("\n")[0]
+
+
 def library_files(
     libraries: Mapping[Platform, bytes], identifier: str, fmi_version: int
 ) -> dict[str, bytes]:

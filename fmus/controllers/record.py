@@ -6,7 +6,9 @@ all modules of this package but its FMUs.
 """
 
 import ctypes
+import hashlib
 import inspect
+import json
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +25,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servobench.fmus.compiler import compile_library, this_platform
+from servobench.fmus.compiler import compile_library, describe_compiler, this_platform
 from servobench.fmus.controllers import branches
 from servobench.fmus.controllers.arrays import (
     DTYPES,
@@ -39,6 +41,7 @@ from servobench.fmus.controllers.functions import carry_out
 from servobench.fmus.controllers.program import STORE, Node, add, block, source
 from servobench.fmus.product import committed
 from servobench.plant.contract import checks, lanes
+from servobench.plant.contract.cache import COMPILED, cached
 from servobench.plant.contract.checks import FloatArray
 
 Inputs: TypeAlias = Mapping[str, Any]
@@ -48,6 +51,18 @@ OWN: Final = "servobench.fmus."
 HEADERS: Final = ("controller.h", "linear_algebra.h")
 # Numbers do not depend on the level of optimisation, and the functions are called from Python.
 CHECKED: Final = ("-O1", "-fvisibility=default")
+# The loop over systems side by side
+SIDE_BY_SIDE: Final = """#include "controller.h"
+
+#define ALL(name) \\
+    void name##_all(long count, double *x, const double *u, double *y, double *codes) \\
+    {{ \\
+        for (long i = 0; i < count; i++) codes[i] = controller_##name(x + i * {}, u + i * {}, y + i * {}); \\
+    }}
+
+ALL(start)
+ALL(step)
+"""
 _LOCK = RLock()
 Traced.function = staticmethod(carry_out)
 
@@ -155,42 +170,70 @@ def recording() -> Iterator[None]:
 class Recorded:
     """A system x(0) = start(u), (x, y) ← step(x, u), as C.
 
-    It is compiled for this machine when it is called for the first time. Both functions return the code of a fault as
-    well, 0 for none.
+    It is compiled for this machine when it is called for the first time, and kept in the user's cache. Arrays may have
+    leading axes, of systems side by side. All functions return the code of a fault as well, 0 for none.
     """
 
     source: str
     states: int  # number of entries of the state
+    inputs: int
     outputs: int
+    flags: tuple[str, ...] = CHECKED  # given to the compiler
 
-    def start(self, u: npt.ArrayLike) -> tuple[FloatArray, float]:
-        """Return x and a code."""
-        return self._called("start", np.empty(self.states), u)[::2]
+    def start(self, u: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return x, (..., states), and codes for inputs (..., inputs)."""
+        x = np.empty((*np.shape(u)[:-1], self.states))
+        _, codes = self._carry_out("start", x, u)
+        return x, codes
 
-    def step(self, x: npt.ArrayLike, u: npt.ArrayLike) -> tuple[FloatArray, FloatArray, float]:
-        """Return x, y and a code."""
-        return self._called("step", np.array(x, dtype=np.float64), u)
+    def step(self, x: npt.ArrayLike, u: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the new x, y and codes."""
+        new = np.array(x, dtype=np.float64)
+        return new, *self.advance(new, u)
 
-    def _called(
+    def advance(self, x: FloatArray, u: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Overwrite x, (..., states), which is contiguous, with the new one; return y, (..., outputs), and codes."""
+        return self._carry_out("step", x, u)
+
+    def prepare(self) -> None:
+        """Compile it unless that was done.
+
+        Raises:
+            ValueError: no compiler, or no folder of one's own for code.
+        """
+        _ = self._library
+
+    def _carry_out(
         self, name: str, x: FloatArray, u: npt.ArrayLike
-    ) -> tuple[FloatArray, FloatArray, float]:
-        y = np.empty(self.outputs)
-        arrays = (x, np.ascontiguousarray(u, dtype=np.float64), y)
-        function = getattr(self._library, f"controller_{name}")
-        function.restype = ctypes.c_double
-        return x, y, function(*(ctypes.c_void_p(each.ctypes.data) for each in arrays))
+    ) -> tuple[FloatArray, FloatArray]:
+        given = np.ascontiguousarray(u, dtype=np.float64)
+        lead = given.shape[:-1]
+        y = np.empty((*lead, self.outputs))
+        codes = np.empty(lead)
+        function = getattr(self._library, f"{name}_all")
+        places = (ctypes.c_void_p(each.ctypes.data) for each in (x, given, y, codes))
+        function(ctypes.c_long(codes.size), *places)
+        return y, codes
 
     @cached_property
     def _library(self) -> ctypes.CDLL:
         target = this_platform()
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
-            folder = Path(name)
-            for header in HEADERS:
-                (folder / header).write_text(committed("controller", header), encoding="utf-8")
-            (folder / "controller.c").write_text(self.source, encoding="utf-8")
-            library = folder / f"controller{target.suffix}"
-            compile_library(folder, ["controller.c"], target, library, CHECKED)
-            return ctypes.CDLL(str(library))
+        name = f"controller{target.suffix}"
+        loop = SIDE_BY_SIDE.format(self.states, self.inputs, self.outputs)
+        files = {header: committed("controller", header) for header in HEADERS}
+        files["controller.c"] = self.source
+        files["side_by_side.c"] = loop
+
+        def make(folder: Path) -> None:
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as sources:
+                for file, text in files.items():
+                    Path(sources, file).write_text(text, encoding="utf-8")
+                compiled = [file for file in files if file.endswith(".c")]
+                compile_library(Path(sources), compiled, target, folder / name, self.flags)
+
+        parts = json.dumps([files, self.flags, describe_compiler(target)])
+        key = hashlib.sha256(parts.encode()).hexdigest()
+        return ctypes.CDLL(str(cached(COMPILED, key, make) / name))
 
 
 def record(
@@ -198,6 +241,7 @@ def record(
     start: Callable[[Any, Inputs], Any],
     step: Callable[[Any, Any, Inputs], tuple[Any, Any]],
     inputs: Shapes,
+    shared: Any = None,  # noqa: ANN401 - anything
 ) -> Recorded:
     """Record a system.
 
@@ -206,12 +250,13 @@ def record(
         start: system, inputs -> state, a tree of arrays.
         step: system, state, inputs -> new state of the same form, and the output.
         inputs: shape and kind of each, in the order of the columns of u.
+        shared: a part of the system that is not copied, such as a function with a lock that no step calls.
 
     Raises:
         NotTraceable: it cannot be recorded; names the function that stands in the way.
     """
     try:
-        own = deepcopy(system)
+        own = deepcopy(system, {id(shared): shared})
     except TypeError as error:
         raise NotTraceable(
             "it holds something that is no formula, such as a solver; take another law"
@@ -233,7 +278,8 @@ def record(
     if [np.shape(leaf) for leaf in new] != [np.shape(leaf) for leaf in first]:
         raise NotTraceable("its state has other sizes later than at the start")
     text = program({"controller_start": beginning, "controller_step": period})
-    return Recorded(text, x.size, np.size(output))
+    given = sum(prod(shape) for shape, _ in inputs.values())
+    return Recorded(text, x.size, given, np.size(output))
 
 
 def _inputs(inputs: Shapes) -> dict[str, Traced]:

@@ -21,6 +21,7 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
+from servobench.harness.run.compiled import describe_compilation
 from servobench.harness.run.own_metrics import OwnMetric
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
@@ -38,6 +39,9 @@ OWN = {
     "task": "own_tasks",
     "metric": "own_metrics",
 }
+
+
+COMPILED = "run.compiled"  # key of the setting
 
 
 def _seeds_word(seeds: range) -> str:
@@ -78,6 +82,8 @@ def describe_batch(
         plant = find_plant(name)
         if plant.engine:
             engines[name] = plant.engine()
+    if any(run.varies(COMPILED) for run in runs.examples) or sections["run"].compiled:
+        engines["controllers in C"] = describe_compilation()
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "plants": list(runs.plants),

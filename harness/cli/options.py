@@ -400,3 +400,16 @@ class Overrides:
         from servobench.harness.config.settings import read_settings
 
         return read_settings(self.config, [*(self.set_ or []), *further])
+
+
+@dataclass(frozen=True)
+class RunOverrides(Overrides):
+    """Settings of runs that a user gives."""
+
+    compiled: Annotated[
+        bool, execution_switch("--compiled", "Step composed controllers in C: run.compiled=true.")
+    ] = False
+
+    def settings(self, *further: str) -> Settings:
+        """Return them, with `further` assignments on top."""
+        return super().settings(*["run.compiled=true"] * self.compiled, *further)

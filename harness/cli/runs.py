@@ -75,7 +75,7 @@ def run(
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     seed: Annotated[int, option("INTEGER", "Seed of everything random in the run.")] = 0,
-    overrides: options.Overrides,
+    overrides: options.RunOverrides,
     view: Annotated[bool, switch("--view", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_figures: FiguresOption = True,
@@ -122,7 +122,7 @@ def compare(
     ] = "",
     metric: options.MetricsOption = None,
     running: options.Batched,
-    overrides: options.Overrides,
+    overrides: options.RunOverrides,
     out: OutOption = None,
     with_figures: FiguresOption = True,
     with_report: ReportOption = True,
@@ -167,7 +167,7 @@ def sweep(
     period: Annotated[str, option("SECONDS", "Control periods [s]: --vary period=...")] = "",
     metric: options.MetricsOption = None,
     running: options.Batched,
-    overrides: options.Overrides,
+    overrides: options.RunOverrides,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each.
 

@@ -14,6 +14,7 @@ from servobench.controllers.servo import ServoController
 from servobench.harness.config.registry import engine_of
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import same_folder
+from servobench.harness.run.compiled import chosen
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import Experiment, build, build_together, naming_the_lack
 from servobench.harness.run.knowledge import keep_networks
@@ -67,7 +68,7 @@ def carry_out(
     ending = Ending()
     with same_folder(), contextlib.closing(experiment.plant) as plant, careful():
         try:
-            pair = held_to_contract(plant, experiment.controller)
+            pair = held_to_contract(plant, chosen(resolved, experiment))
             with naming_the_lack(plant, own_robot=experiment.drawn.true is None):
                 run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
         except BaseException as error:
@@ -113,7 +114,8 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
     bench, log = cast(Bench, many.plant), ManyLogs(many.plant.spec, many.periods, ends)
     try:
         with same_folder(), careful(), contextlib.suppress(AllEnded):
-            servo = ManyServos(cast(ServoController, many.controller).servo, ends)
+            controller = cast(ServoController, chosen(runs[0], many))
+            servo = ManyServos(controller.servo, ends)
             seeds = [each.request.seed for each in runs]
             run_loop(ManyBenches(bench, ends), servo, many.desired(), many.loop, seeds, log)
     finally:

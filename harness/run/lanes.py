@@ -162,10 +162,7 @@ class ManyServos(Controller):
         """
         given = (observation, reference)
         lanes = self._ends.running
-        stay = self._ends.left_of(self._mine)
-        self._mine = lanes
-        if stay is not None:
-            self._state = take(self._state, stay)
+        self._leave()
         if len(lanes) < self._ends.count:
             given = take(given, lanes)
         try:
@@ -177,10 +174,23 @@ class ManyServos(Controller):
             for lane, fault in failing:
                 self._ends.end(int(lanes[lane]), fault, self._k)
             return self.step(observation, reference)
+        for lane, fault in self._servo.faults.items():
+            self._ends.end(int(lanes[lane]), fault, self._k)
+        stay = self._leave()
+        if stay is not None:
+            u = take(u, stay)
         self._k += 1
         self._u = self._ends.spread(u, self._u)
         self._jacobian = self._ends.spread(self._servo.jacobian(self._state), self._jacobian)
         return Command(self._u)
+
+    def _leave(self) -> LaneIndex | None:
+        """Let runs that ended leave the state; return which of its lanes stay, or None if all do."""
+        stay = self._ends.left_of(self._mine)
+        self._mine = self._ends.running
+        if stay is not None:
+            self._state = take(self._state, stay)
+        return stay
 
     def estimated_jacobian(self) -> FloatArray:
         """See `Controller.estimated_jacobian`."""

@@ -55,6 +55,8 @@ class RunSettings:
     """share of the run after which a mismatch's `camera_move` happens"""
     full_jacobian: bool = False
     """log every entry of the estimated and the true Jacobian"""
+    compiled: bool = False
+    """steps of composed controllers in C, without diagnostics; numpy goes on where that cannot be"""
 
     @property
     def preview_rows(self) -> int:

@@ -32,7 +32,8 @@ FILES: Final = "files"
 UNFINISHED: Final = ".unfinished-"
 EXTRACTED: Final = "extracted"  # kind of unpacked FMUs
 BUILT: Final = "fmus"  # kind of FMUs that were built here
-CODE: Final = (EXTRACTED, BUILT)  # kinds whose files are loaded as code
+COMPILED: Final = "compiled"  # kind of controllers in C that were compiled here
+CODE: Final = (EXTRACTED, BUILT, COMPILED)  # kinds whose files are loaded as code
 PRIVATE: Final = 0o700  # mode of a folder that is for its owner only
 # Errors of a folder that this user may not write
 NOT_ALLOWED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)

@@ -3,16 +3,14 @@
 The step of a controller is recorded, and a run of it is kept inside the FMU for comparison.
 """
 
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.controllers.servo import Servo, ServoController, ServoState
 from servobench.fmus.controllers.arrays import NotTraceable
 from servobench.fmus.controllers.branches import leaves_of
 from servobench.fmus.controllers.export import (
@@ -25,12 +23,12 @@ from servobench.fmus.controllers.export import (
     ControllerModel,
     controller_groups,
 )
-from servobench.fmus.controllers.record import Recorded, record
+from servobench.fmus.controllers.record import Recorded
 from servobench.fmus.export import ExportOptions, nominal_setup, product
 from servobench.fmus.product import Product
-from servobench.fmus.variables import INPUT
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, flatten
+from servobench.harness.run.compiled import NoForm, record_step
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.request import RunRequest
@@ -40,7 +38,6 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
-from servobench.plant.contract.signals import Observation, trusted_observation
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import find_robot
 
@@ -61,10 +58,6 @@ def controller_model(request: RunRequest, settings: Settings) -> ControllerModel
         ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
     """
     entry = find_controller(request.controller)
-    if entry.needs_truth:
-        raise ConfigurationError(
-            f"controller {entry.name!r} cannot be exported: it is given the true robot"
-        )
     resolved = resolve(request, settings)
     experiment = build(resolved)
     with closing(experiment.plant):
@@ -77,35 +70,15 @@ def _model(
     controller = experiment.controller
     spec = experiment.plant.spec
     name = f"controller {entry.name!r}"
-    if not isinstance(controller, ServoController):
-        raise ConfigurationError(
-            f"{name} cannot be exported: it is not composed of an estimator and a law"
-        )
-    if controller.servo.calibration is not None:
-        remedy = "take aids.model=regression"
-        raise ConfigurationError(
-            f"{name} cannot be exported while it fits the arm (aids.model=arm): {remedy}"
-        )
-    if not controller.servo.initial.immediate:
-        remedy = "set initial.source to nominal or given"
-        raise ConfigurationError(
-            f"{name} cannot be exported while it probes its initial Jacobian: {remedy}"
-        )
     groups = controller_groups(spec.n, spec.m, 1 + experiment.run.preview_rows, spec.feature_unit)
-    shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
-    shapes |= {
-        each.name: (each.shape, "b" if each.name == SEEN else "f")
-        for each in groups
-        if each.role == INPUT
-    }
-    columns, states = _run(experiment)
-    inputs = np.column_stack([columns[each] for each in shapes])
-    outputs = np.column_stack([columns[COMMAND], columns[JACOBIAN]])
     try:
-        recorded = record(
-            controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes
-        )
+        recorded, parts = record_step(entry, controller)
+        columns, states = _run(experiment)
+        inputs = np.column_stack([columns[each] for each in parts])
+        outputs = np.column_stack([columns[COMMAND], columns[JACOBIAN]])
         kept = _repeated_periods(recorded, inputs, outputs, states)
+    except NoForm as error:
+        raise ConfigurationError(f"{name} cannot be exported{error}") from error
     except NotTraceable as error:
         sensing = resolved.request.sensing
         where = "" if sensing == DEFAULT_SENSING else f" with the sensing {sensing}"
@@ -161,22 +134,6 @@ def _repeated_periods(
                 f"over {STRETCH} periods it would differ from the original by {largest:.1g}, {allowed}"
             )
     return int(np.argmin(whole <= 0.1 * TOLERANCE))
-
-
-def _observation(inputs: Mapping[str, Any]) -> Observation:
-    valid = inputs[SEEN]
-    both = inputs[POSITION], inputs[FEATURE]
-    return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
-
-
-def _step(
-    servo: Servo, state: ServoState, inputs: Mapping[str, Any]
-) -> tuple[ServoState, FloatArray]:
-    """Return the new state, and command and Jacobian in one row."""
-    state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
-    jacobian = servo.jacobian(state)
-    known = np.where(np.isnan(jacobian), 0.0, jacobian)
-    return state, np.concatenate([velocity, known.reshape(-1)])
 
 
 def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray]]:

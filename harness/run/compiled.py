@@ -1,0 +1,222 @@
+"""Composed controllers in C: the step of a servo, recorded and compiled for this machine.
+
+numpy is the source, and goes on where a controller has no form in C or the machine no compiler. Rows equal those of
+numpy up to rounding; a run in C has the same bits alone and beside others.
+"""
+
+import contextlib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast, final
+
+import numpy as np
+
+from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics
+from servobench.controllers.servo import Servo, ServoController, ServoState, Stepped
+from servobench.fmus.compiler import CODE, describe_compiler, this_platform
+from servobench.fmus.controllers.branches import NOT_DEFINITE
+from servobench.fmus.controllers.export import (
+    FEATURE,
+    POSITION,
+    REFERENCE,
+    SEEN,
+    controller_groups,
+)
+from servobench.fmus.controllers.record import Recorded, record
+from servobench.fmus.variables import INPUT
+from servobench.harness.config.registry import find_controller
+from servobench.harness.run.experiment import Experiment
+from servobench.harness.run.resolution import ResolvedRun
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ControllerDiverged, FilterDiverged
+from servobench.plant.contract.settings import remark
+from servobench.plant.contract.signals import Observation, trusted_observation
+
+CPU_INFO: Final = Path("/proc/cpuinfo")
+# Wide vectors, where the processor has them. No operation is fused or reordered, so that the bits are the same.
+WIDE: Final = "avx2"
+FLAGS: Final = ("-fvisibility=default",)
+NOT_FINITE: Final = ControllerDiverged, "the estimate or the command is not finite"
+CAUSES: Final = {NOT_DEFINITE: (FilterDiverged, "a covariance is not positive definite")}
+"""Kinds of faults and words for the codes of faults, other than those of `NOT_FINITE`."""
+
+
+class NoForm(ValueError):
+    """A controller has no form in C; the message continues "it cannot be exported", from its punctuation on."""
+
+
+def record_step(entry: ControllerEntry, controller: Controller) -> tuple[Recorded, tuple[str, ...]]:
+    """Record the step of a controller that an entry has built.
+
+    Returns:
+        The step with the columns [time, inputs], whose outputs are command (n) and Jacobian (m, n), 0 before there is
+        one; and the names of the columns' parts.
+
+    Raises:
+        NoForm: it has no form in C; says why.
+        NotTraceable: its numpy code cannot be recorded; says where.
+    """
+    if entry.needs_truth:
+        raise NoForm(": it is given the true robot")
+    if not isinstance(controller, ServoController):
+        raise NoForm(": it is not composed of an estimator and a law")
+    servo = controller.servo
+    if servo.calibration is not None:
+        raise NoForm(" while it fits the arm (aids.model=arm): take aids.model=regression")
+    if not servo.initial.immediate:
+        remedy = "set initial.source to nominal or given"
+        raise NoForm(f" while it probes its initial Jacobian: {remedy}")
+    spec = servo.knowledge.spec
+    groups = controller_groups(spec.n, spec.m, 1 + servo.knowledge.preview, spec.feature_unit)
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
+    for group in groups:
+        if group.role == INPUT:
+            shapes[group.name] = (group.shape, "b" if group.name == SEEN else "f")
+    recorded = record(servo, _start, _step, shapes, servo.knowledge.train)
+    return recorded, tuple(shapes)
+
+
+def _observation(inputs: Mapping[str, Any]) -> Observation:
+    valid = inputs[SEEN]
+    both = inputs[POSITION], inputs[FEATURE]
+    return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
+
+
+def _start(servo: Servo, inputs: Mapping[str, Any]) -> ServoState:
+    return servo.start(_observation(inputs))
+
+
+def _step(
+    servo: Servo, state: ServoState, inputs: Mapping[str, Any]
+) -> tuple[ServoState, FloatArray]:
+    """Return the new state, and command and Jacobian in one row."""
+    state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
+    jacobian = servo.jacobian(state)
+    known = np.where(np.isnan(jacobian), 0.0, jacobian)
+    return state, np.concatenate([velocity, known.reshape(-1)])
+
+
+class CompiledState(NamedTuple):
+    """The state of a controller in C."""
+
+    x: FloatArray  # (..., states)
+    jacobian: FloatArray  # of the last step, (..., m, n) [unit of the feature/rad]; NaN before
+
+
+@final
+class CompiledServo(Servo):
+    """A servo whose step is C, for one run or many side by side.
+
+    Many share one state that each step overwrites; of a single run each step has a state of its own.
+    """
+
+    states = CompiledState
+
+    def __init__(self, servo: Servo, recorded: Recorded) -> None:
+        """Take a servo and its recorded step."""
+        vars(self).update(vars(servo))
+        self._recorded = recorded
+
+    def start(self, observation: Observation) -> Any:  # noqa: ANN401 - a state of its own
+        """See `Servo.start`."""
+        spec = self.knowledge.spec
+        unknown = np.zeros((*observation.feature.shape[:-1], 1 + self.knowledge.preview, spec.m))
+        x, _ = self._recorded.start(_row(observation, unknown))
+        return CompiledState(x, np.full((*x.shape[:-1], spec.m, spec.n), np.nan))
+
+    def step(self, state: Any, observation: Observation, reference: FloatArray) -> Any:  # noqa: ANN401
+        """See `Servo.step`; the faults of runs side by side are in `faults`.
+
+        Raises:
+            RunFault: the estimate or the command of a single run is not finite, or its covariance not definite.
+        """
+        single = state.x.ndim == 1
+        x = state.x.copy() if single else state.x
+        outputs, codes = self._recorded.advance(x, _row(observation, reference))
+        errors = {}
+        for lane in np.flatnonzero(codes):
+            kind, cause = CAUSES.get(int(codes.flat[lane]), NOT_FINITE)
+            errors[int(lane)] = kind(f"{cause} at {observation.time:.5g} s")
+        if single and errors:
+            raise errors[0]
+        self.faults = errors
+        spec = self.knowledge.spec
+        velocity, jacobian = np.split(outputs, [spec.n], axis=-1)
+        new = CompiledState(x, jacobian.reshape(*codes.shape, spec.m, spec.n))
+        return Stepped(cast(Any, new), velocity)
+
+    def jacobian(self, state: Any) -> FloatArray:  # noqa: ANN401
+        """See `Servo.jacobian`."""
+        return np.asarray(state.jacobian)
+
+    def diagnostics(self, state: Any) -> Diagnostics:  # noqa: ANN401
+        """Return nothing: what the stages know stays in C."""
+        return {}
+
+
+def _row(observation: Observation, reference: FloatArray) -> FloatArray:
+    """Return the columns of a recorded step, (..., inputs)."""
+    lead = observation.feature.shape[:-1]
+    parts = (
+        np.full((*lead, 1), observation.time),
+        observation.joint_position,
+        observation.feature,
+        observation.valid,
+        reference.reshape(*lead, -1),
+    )
+    return np.concatenate(parts, axis=-1)
+
+
+_FOUND: dict[str, Recorded | str] = {}
+
+
+def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
+    """Return the controller of a run, or of runs of its kind side by side.
+
+    It is in C where the run asks for it; where that cannot be, a remark says why numpy goes on.
+    """
+    controller = experiment.controller
+    if not run.run.compiled:
+        return controller
+    request = run.request
+    plant = experiment.plant
+    kind = (request.controller, run.controller, request.robot, request.sensing, run.run, plant.spec)
+    key = repr(kind)
+    if key not in _FOUND:
+        _FOUND[key] = (
+            "frames are stamped" if plant.stamps else _compile(request.controller, controller)
+        )
+    found = _FOUND[key]
+    if isinstance(found, str):
+        remark(f"controller {request.controller!r} goes on in numpy: {found}")
+        return controller
+    return ServoController(CompiledServo(cast(ServoController, controller).servo, found))
+
+
+def _compile(name: str, controller: Controller) -> Recorded | str:
+    """Return the compiled step of a controller, or why there is none."""
+    try:
+        recorded, _ = record_step(find_controller(name), controller)
+        fast = replace(recorded, flags=(*FLAGS, *_processor_flags()))
+        fast.prepare()
+    except NoForm as error:
+        return f"it cannot be compiled{error}"
+    except ValueError as error:
+        return str(error)
+    return fast
+
+
+def _processor_flags() -> tuple[str, ...]:
+    with contextlib.suppress(OSError):
+        if WIDE in CPU_INFO.read_text(encoding="utf-8").split():
+            return (f"-m{WIDE}",)
+    return ()
+
+
+def describe_compilation() -> str:
+    """Return the compiler of this machine with the flags for controllers; "" without one."""
+    with contextlib.suppress(ValueError):
+        compiler = describe_compiler(this_platform())
+        return " ".join((compiler, *CODE, *FLAGS, *_processor_flags()))
+    return ""

@@ -1,0 +1,126 @@
+"""Controllers in C: rows of numpy up to rounding, the same bits alone and beside others, and what goes on in numpy."""
+
+import numpy as np
+import pytest
+
+from kit.lanes import assert_rows_of_single_runs, rows
+from kit.nightly import some
+from servobench.controllers.laws.mfac import MfacLaw
+from servobench.controllers.methods import METHODS
+from servobench.fmus.controllers.record import Recorded
+from servobench.harness.config.settings import Settings
+from servobench.harness.run import compiled
+from servobench.harness.run.episode import carry_out, carry_out_together
+from servobench.harness.run.experiment import build
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
+
+SEEDS = (40011, 40012, 40013, 40014)
+# Camera latency and lost frames, on moves that are short
+ROUGH = {
+    "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}},
+    "random": {"duration": 2.5},
+}
+TRACED = [
+    name
+    for name in METHODS
+    if METHODS[name].side_by_side
+    and name not in ("calibrating_mfac", "ukf_mpc", "ukf_mpc:published")
+]
+
+
+def runs(controller, in_c, settings=ROUGH, mismatch="severe", sensing="position"):
+    own = {**settings, "run": {**settings.get("run", {}), "compiled": in_c}}
+    return [
+        resolve(
+            RunRequest("kinematic", controller, "random", mismatch, seed, sensing=sensing),
+            Settings(own),
+        )
+        for seed in SEEDS
+    ]
+
+
+def assert_near(found, wanted):
+    """Compare rows of runs in C with those in numpy."""
+    for one, other in zip(found, wanted, strict=True):
+        assert one.keys() == other.keys()
+        for name, value in other.items():
+            if isinstance(value, float):
+                assert one[name] == pytest.approx(value, rel=1e-9, abs=1e-9, nan_ok=True), name
+            else:
+                assert one[name] == value, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("controller", some(TRACED, "regression_mfac", "ukf_mfac:published"))
+def test_rows_are_those_of_numpy_and_of_each_run_alone(controller, monkeypatch):
+    monkeypatch.setattr(compiled, "_FOUND", {})
+    together = runs(controller, in_c=True)
+    in_c = assert_rows_of_single_runs(together)
+    assert [type(each) for each in compiled._FOUND.values()] == [Recorded]
+    assert_near(in_c, rows(carry_out_together(runs(controller, in_c=False))))
+
+
+@pytest.mark.slow
+def test_pixels_and_lost_features_are_those_of_numpy():
+    settings = {
+        "kinematic": {"sensing": {"drop_probability": 0.65}},
+        "run": {"lost_after": 0.45},
+        "random": {"duration": 2.5},
+    }
+    in_c = assert_rows_of_single_runs(
+        runs("ukf_mfac", in_c=True, settings=settings, sensing="pixel")
+    )
+    assert {row["status"] for row in in_c} == {"completed", "feature_lost"}
+    assert_near(in_c, rows(carry_out_together(runs("ukf_mfac", False, settings, sensing="pixel"))))
+
+
+@pytest.mark.slow
+def test_a_command_that_is_not_finite_ends_only_its_run(monkeypatch):
+    monkeypatch.setattr(compiled, "_FOUND", {})
+    command = MfacLaw.command
+
+    def fragile(self, state, estimate, observation, reference):
+        state, velocity = command(self, state, estimate, observation, reference)
+        bad = (observation.time > 0.3) & (observation.feature[..., 0] > 0.05)
+        return state, np.where(bad[..., None], np.inf, velocity)
+
+    together = runs("ukf_mfac:published", in_c=True)
+    monkeypatch.setattr(MfacLaw, "command", fragile)
+    in_c = assert_rows_of_single_runs(together)
+    assert {row["status"] for row in in_c} == {"completed", "controller_diverged"}
+    wanted = rows(carry_out_together(runs("ukf_mfac:published", in_c=False)))
+    for one, other in zip(in_c, wanted, strict=True):
+        reasons = one.pop("reason"), other.pop("reason")
+        assert bool(reasons[0]) == bool(reasons[1])
+    assert_near(in_c, wanted)
+
+
+@pytest.mark.parametrize(
+    ("controller", "settings", "why"),
+    [
+        ("calibrating_mfac", {}, "it cannot be compiled while it fits the arm"),
+        ("nmpc_calibrated", {}, "it cannot be compiled: it is given the true robot"),
+        ("ukf_mpc", {}, "it holds something that is no formula, such as a solver"),
+        ("rls", {"kinematic": {"sensing": {"stamps": True}}}, "frames are stamped"),
+    ],
+)
+def test_what_has_no_form_in_c_goes_on_in_numpy_and_says_so(controller, settings, why, monkeypatch):
+    said = []
+    monkeypatch.setattr(compiled, "remark", said.append)
+    run, *_ = runs(controller, in_c=True, settings={**settings, "random": {"duration": 0.1}})
+    experiment = build(run)
+    assert compiled.chosen(run, experiment) is experiment.controller
+    assert said[0].startswith(f"controller {controller!r} goes on in numpy: {why}")
+
+
+def test_without_a_compiler_numpy_goes_on(monkeypatch):
+    said = []
+    monkeypatch.setattr(compiled, "remark", said.append)
+    monkeypatch.setattr(compiled, "_FOUND", {})
+    monkeypatch.setenv("CC", "/nothing/cc")
+    run, *_ = runs("constant", in_c=True, settings={"random": {"duration": 0.1}})
+    assert carry_out(run).row["status"] == "completed"
+    assert "'constant' goes on in numpy" in said[0]
+    assert "CC names '/nothing/cc'" in said[0]
+    assert compiled.describe_compilation() == ""
