@@ -11,7 +11,7 @@ import inspect
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
@@ -143,14 +143,15 @@ _MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
 
 
 @contextmanager
-def recording() -> Iterator[None]:
-    """Record numpy code of this package within the context: it computes with traced arrays."""
+def recording(modules: Container[str] = ()) -> Iterator[None]:
+    """Record numpy code of this package, and of some modules, within the context: it computes with traced arrays."""
     changed = []
     meanings = {id(old): new for old, new in _MEANINGS}
     with _LOCK:
         try:
             for name, module in list(sys.modules.items()):
-                if not name.startswith(PACKAGE) or name.startswith(OWN):
+                own = name.startswith(PACKAGE) and not name.startswith(OWN)
+                if not own and name not in modules:
                     continue
                 space = vars(module)
                 for key, value in list(space.items()):
@@ -241,7 +242,9 @@ def record(
     start: Callable[[Any, Inputs], Any],
     step: Callable[[Any, Any, Inputs], tuple[Any, Any]],
     inputs: Shapes,
+    *,
     shared: Any = None,  # noqa: ANN401 - anything
+    modules: Container[str] = (),
 ) -> Recorded:
     """Record a system.
 
@@ -251,6 +254,7 @@ def record(
         step: system, state, inputs -> new state of the same form, and the output.
         inputs: shape and kind of each, in the order of the columns of u.
         shared: a part of the system that is not copied, such as a function with a lock that no step calls.
+        modules: with code of users that the step calls.
 
     Raises:
         NotTraceable: it cannot be recorded; names the function that stands in the way.
@@ -262,7 +266,7 @@ def record(
             "it holds something that is no formula, such as a solver; take another law"
         ) from error
     try:
-        with recording():
+        with recording(modules):
             with block() as beginning:
                 tree = start(own, _inputs(inputs))
                 first = leaves_of(tree)

@@ -73,7 +73,9 @@ def record_step(entry: ControllerEntry, controller: Controller) -> tuple[Recorde
     for group in groups:
         if group.role == INPUT:
             shapes[group.name] = (group.shape, "b" if group.name == SEEN else "f")
-    recorded = record(servo, _start, _step, shapes, servo.knowledge.train)
+    parts = servo.estimation.estimator, servo.law, servo.initial
+    modules = {type(part).__module__ for part in parts}  # some may be a user's
+    recorded = record(servo, _start, _step, shapes, shared=servo.knowledge.train, modules=modules)
     return recorded, tuple(shapes)
 
 

@@ -1,8 +1,11 @@
 """Controllers in C: rows of numpy up to rounding, the same bits alone and beside others, and what goes on in numpy."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import servobench
 from kit.lanes import assert_rows_of_single_runs, rows
 from kit.nightly import some
 from servobench.controllers.laws.mfac import MfacLaw
@@ -15,6 +18,7 @@ from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 
+EXAMPLE = Path(__file__).parents[2] / "docs/examples/nominal-rate/nominal_rate.py"
 SEEDS = (40011, 40012, 40013, 40014)
 # Camera latency and lost frames, on moves that are short
 ROUGH = {
@@ -124,3 +128,14 @@ def test_without_a_compiler_numpy_goes_on(monkeypatch):
     assert "'constant' goes on in numpy" in said[0]
     assert "CC names '/nothing/cc'" in said[0]
     assert compiled.describe_compilation() == ""
+
+
+def test_an_estimator_of_a_users_is_compiled_with_the_rest(monkeypatch):
+    monkeypatch.setattr(compiled, "_FOUND", {})
+    place = f"{EXAMPLE}:BROYDEN_ENTRY"
+    found = []
+    for in_c in (False, True):
+        settings = {"run": {"compiled": in_c}, "random": {"duration": 1.0}}
+        found.append(servobench.compare([place], tasks=("random",), seeds=2, settings=settings))
+    assert [type(each) for each in compiled._FOUND.values()] == [Recorded]
+    assert_near(*(each[["rms_error", "outcome"]].to_dict("records") for each in found))
