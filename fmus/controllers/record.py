@@ -193,7 +193,7 @@ class Recorded:
         return new, *self.advance(new, u)
 
     def advance(self, x: FloatArray, u: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Overwrite x, (..., states), which is contiguous, with the new one; return y, (..., outputs), and codes."""
+        """Overwrite x, (..., states) without gaps, with the new one; return y, (..., outputs), and codes, (...)."""
         return self._carry_out("step", x, u)
 
     def prepare(self) -> None:

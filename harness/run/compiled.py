@@ -43,7 +43,7 @@ CAUSES: Final = {NOT_DEFINITE: (FilterDiverged, "a covariance is not positive de
 
 
 class NoForm(ValueError):
-    """A controller has no form in C; the message continues "it cannot be exported", from its punctuation on."""
+    """A controller has no form in C; its message goes on after "it cannot be exported"."""
 
 
 def record_step(entry: ControllerEntry, controller: Controller) -> tuple[Recorded, tuple[str, ...]]:
@@ -73,10 +73,17 @@ def record_step(entry: ControllerEntry, controller: Controller) -> tuple[Recorde
     for group in groups:
         if group.role == INPUT:
             shapes[group.name] = (group.shape, "b" if group.name == SEEN else "f")
-    parts = servo.estimation.estimator, servo.law, servo.initial
-    modules = {type(part).__module__ for part in parts}  # some may be a user's
+    modules = {part.__module__ for part in _classes(controller)}
     recorded = record(servo, _start, _step, shapes, shared=servo.knowledge.train, modules=modules)
     return recorded, tuple(shapes)
+
+
+def _classes(controller: Controller) -> tuple[type, ...]:
+    """Return the classes of the parts of a composed controller, some of which may be a user's."""
+    if not isinstance(controller, ServoController):
+        return (type(controller),)
+    servo = controller.servo
+    return type(servo.estimation.estimator), type(servo.law), type(servo.initial)
 
 
 def _observation(inputs: Mapping[str, Any]) -> Observation:
@@ -170,7 +177,7 @@ def _row(observation: Observation, reference: FloatArray) -> FloatArray:
     return np.concatenate(parts, axis=-1)
 
 
-_FOUND: dict[str, Recorded | str] = {}
+_FOUND: dict[tuple[Any, ...], Recorded | str] = {}
 
 
 def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
@@ -184,7 +191,7 @@ def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
     request = run.request
     plant = experiment.plant
     kind = (request.controller, run.controller, request.robot, request.sensing, run.run, plant.spec)
-    key = repr(kind)
+    key = (repr(kind), *_classes(controller))  # A notebook may define a class anew.
     if key not in _FOUND:
         _FOUND[key] = (
             "frames are stamped" if plant.stamps else _compile(request.controller, controller)
