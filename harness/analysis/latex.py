@@ -13,6 +13,7 @@ from servobench.harness.analysis.folder import (
     describe_tuning,
 )
 from servobench.harness.analysis.tables import DIFFERENCE, Statistics, as_text
+from servobench.harness.batch.results import Manifest
 from servobench.harness.config.installation import short_commit
 from servobench.harness.run.outcome import FOLLOWED, SETTLED
 from servobench.harness.run.variations import varied_columns
@@ -131,7 +132,7 @@ def _heading(name: str, side: str) -> str:
 
 
 def methods_paragraph(
-    manifest: Mapping[str, Any],
+    manifest: Manifest,
     runs: pd.DataFrame,
     statistics: Statistics,
     names: Mapping[str, str],
@@ -179,7 +180,7 @@ def methods_paragraph(
     return rf"\paragraph{{Methods}} {text}." + f"\n\n{entry}"
 
 
-def _used_libraries(manifest: Mapping[str, Any]) -> list[str]:
+def _used_libraries(manifest: Manifest) -> list[str]:
     """Return the numerical libraries and the engines with their versions, as far as known."""
     packages = manifest.get("packages") or {}
     libraries = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
@@ -187,7 +188,7 @@ def _used_libraries(manifest: Mapping[str, Any]) -> list[str]:
     return [*libraries, *map(str, engines.values())]
 
 
-def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
+def _combinations(manifest: Manifest, facts: Mapping[str, str]) -> str:
     """Return a sentence on controllers, tasks, plant, sensing and mismatch."""
     titles = [str(each.get("title")) for each in manifest.get("robots", [])]
     robots = ", ".join(titles) or "unknown robot"
@@ -197,7 +198,7 @@ def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
     )
 
 
-def _aids(manifest: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
+def _aids(manifest: Manifest, names: Mapping[str, str]) -> list[str]:
     """Return a sentence on the aids of several controllers, by their names in tables; none for a single one."""
     aids = describe_controllers(manifest, names)
     if not aids:

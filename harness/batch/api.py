@@ -25,7 +25,7 @@ from servobench.harness.batch.plan import (
     refuse_tuning_seeds,
 )
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.results import ResultsFolder, load_runs
+from servobench.harness.batch.results import Manifest, ResultsFolder, load_runs
 from servobench.harness.config.registry import (
     can_travel,
     choose_controller,
@@ -58,7 +58,7 @@ class Results(NamedTuple):
     """a row a run"""
     steps: pd.DataFrame | None
     """a row a control period of each run; None if they were not kept"""
-    manifest: dict[str, Any]
+    manifest: Manifest
     """configuration, versions and seeds"""
 
 

@@ -37,7 +37,7 @@ from servobench.harness.batch.lock import check_empty, is_unused, locked
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.results import ResultsFolder, load_runs
+from servobench.harness.batch.results import Manifest, ResultsFolder, load_runs
 from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings
@@ -209,7 +209,7 @@ def _carry_out_at(
         store.put_together(opened, manifest)
 
 
-def _resume(folder: ResultsFolder, manifest: dict[str, Any], observer: Observer) -> None:
+def _resume(folder: ResultsFolder, manifest: Manifest, observer: Observer) -> None:
     """Refuse a folder of another batch, and mend one of this batch before anything is computed."""
     restored = restore_manifest(folder, manifest)
     check_same_batch(folder, manifest, observer.note, remedy="give another folder as `out`")

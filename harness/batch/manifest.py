@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch.plan import Survey
+from servobench.harness.batch.schema import Manifest
 from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
 from servobench.harness.config.registry import (
     CONTROLLER_REGISTRY,
@@ -53,7 +54,7 @@ def describe_batch(
     own: Sequence[Offer] = (),
     *,
     steps: bool = False,
-) -> dict[str, Any]:
+) -> Manifest:
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
     Args:

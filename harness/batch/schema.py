@@ -1,14 +1,14 @@
 """The schema of `manifest.json`: its version, its entries and their types; written as text, and read."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from servobench.harness.batch.tables import DamagedFile
 from servobench.harness.config.description import plain
 from servobench.plant.contract.faults import ConfigurationError
 
+Manifest: TypeAlias = dict[str, Any]  # its entries by name
 MANIFEST: Final = "manifest.json"
 SCHEMA_VERSION: Final = "4"
 # Since an earlier schema
@@ -29,12 +29,12 @@ class OtherSchema(ConfigurationError):
     """A results folder is of another version of this package."""
 
 
-def encode(manifest: Mapping[str, Any]) -> str:
+def encode(manifest: Manifest) -> str:
     """Return a manifest as text; JSON has no infinity, so a setting without limit reads "inf"."""
     return json.dumps(plain({"schema_version": SCHEMA_VERSION, **manifest}), indent=2) + "\n"
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a folder.
 
     Raises:

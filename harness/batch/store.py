@@ -4,10 +4,9 @@ Each file is written atomically, with its checksum before it has its name; `resu
 """
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pyarrow as pa
@@ -19,6 +18,7 @@ from servobench.harness.batch.results import (
     PICTURES,
     RUNS,
     STEPS,
+    Manifest,
     ResultsFolder,
     part_name,
 )
@@ -30,7 +30,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
 
 
-def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
+def create_folder(folder: Path, manifest: Manifest) -> None:
     """Make a new results folder with its manifest, also where an earlier call could not.
 
     Raises:
@@ -45,7 +45,7 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
         write_manifest(folder, manifest)
 
 
-def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write `manifest.json`."""
     write_vouched(folder, {MANIFEST: _text(encode(manifest))})
 
@@ -92,7 +92,7 @@ def _write_picture(path: Path, result: RunResult) -> None:
     write_atomically(path, lambda file: file.write_bytes(content))
 
 
-def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: dict[str, Any]) -> None:
+def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: Manifest) -> None:
     """Make a folder that holds several sweeps a results folder itself: one table of all their runs.
 
     Args:
@@ -124,7 +124,7 @@ def collect(folder: ResultsFolder) -> int:
     return put_together(folder, folder.manifest)
 
 
-def put_together(folder: ResultsFolder, manifest: Mapping[str, Any]) -> int:
+def put_together(folder: ResultsFolder, manifest: Manifest) -> int:
     """Put the parts of a folder with this manifest together; result and errors are those of `collect`."""
     path = folder.path
     wanted = manifest.get("run_count", 0)
