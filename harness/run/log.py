@@ -12,13 +12,19 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.controller import Diagnostics
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.lanes import norm
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, column_names
+from servobench.plant.contract.signals import (
+    BoolArray,
+    Command,
+    Observation,
+    PlantSpec,
+    Truth,
+    column_names,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,7 +51,7 @@ class Steps:
     true_feature: FloatArray  # (k, ..., m) [unit of the feature]
     joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
     command: FloatArray  # (k, ..., n) [rad/s]
-    feature_valid: npt.NDArray[np.bool_]  # (k, ...), whether a measurement arrived
+    feature_valid: BoolArray  # (k, ...), whether a measurement arrived
     capture_time: FloatArray  # (k, ...), exposure of the last one by the camera's clock [s]
     # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
     estimated_jacobian: FloatArray
@@ -190,7 +196,7 @@ class StepLog:
             rows.diagnostics[name][k] = value
         self._count += 1
 
-    def end(self, lanes: npt.NDArray[np.bool_], fault: RunFault) -> None:
+    def end(self, lanes: BoolArray, fault: RunFault) -> None:
         """End the run for a fault that the loop found; runs side by side end those in the lanes.
 
         Raises:

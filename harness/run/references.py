@@ -228,21 +228,8 @@ class ImageReference(Reference):
 
 @final
 @dataclass(frozen=True, eq=False)
-class TaughtImage(ImageReference):
-    """The target where it is with the arm at given joint positions."""
-
-    joint_position: FloatArray  # (n,) [rad]
-
-    def points(self, time: npt.ArrayLike) -> FloatArray:
-        """Return the same place at all times."""
-        points = self.model.points(self.joint_position)
-        return np.broadcast_to(points, (*np.shape(time), *points.shape)).copy()
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class LedImage(ImageReference):
-    """The target where it is while the arm is led along a path."""
+    """The target where it is while the arm is led along a path, or rests where it was taught."""
 
     path: JointPath
 
