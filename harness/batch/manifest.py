@@ -114,21 +114,16 @@ def plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
         (PLANT_REGISTRY, runs.plants),
         (TASK_REGISTRY, runs.tasks),
     )
-    for name, point in (
-        (name, registry.published(name)) for registry, names in kinds for name in names
-    ):
-        if point is not None:
-            made = (
-                f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
-            )
-            yield (
-                name,
-                {
-                    "place": point.value,
-                    "distribution": made,
-                    "sha256": digest_of_module(point.module),
-                },
-            )
+    for registry, names in kinds:
+        for name in names:
+            point = registry.published(name)
+            if point is None:
+                continue
+            made = "unknown"
+            if point.dist is not None:
+                made = f"{point.dist.name} {point.dist.version}"
+            digest = digest_of_module(point.module)
+            yield name, {"place": point.value, "distribution": made, "sha256": digest}
 
 
 def describe_sensing(word: str) -> dict[str, Any]:
@@ -178,10 +173,12 @@ def named_files(
     own = tuple(own)
     found = {name: user_path(name) for name in _names(runs, configuration, own)}
     for each in own:
-        found |= {} if each.given or not each.file else _code(each.place, Path(each.file))
+        if each.file and not each.given:
+            found |= _code(each.place, Path(each.file))
     for word in runs.sensings:
         source = sensing_file(word)
-        found |= {} if source is None else _code(sensing_place(word), source.path)
+        if source is not None:
+            found |= _code(sensing_place(word), source.path)
     return {name: digest(path) for name, path in found.items() if path.is_file()}
 
 
@@ -190,13 +187,15 @@ def _names(
 ) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
     yield from (read_word(name).robot for name in runs.robots)
-    for camera in (find_robot(name).camera for name in runs.robots):
-        yield from () if camera is None else map(str, camera.files)
+    for name in runs.robots:
+        camera = find_robot(name).camera
+        if camera is not None:
+            yield from map(str, camera.files)
     yield from filter(None, (each.mismatch.calibration for each in runs.examples))
     for values in configuration.values():
-        yield from (
-            str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value
-        )
+        for key, value in values.items():
+            if key.split(".")[-1] == "file" and value:
+                yield str(value)
     for name in (*runs.plants, *runs.controllers, *(each.place for each in own)):
         if name.startswith(FILES):
             path = name.partition(":")[2]

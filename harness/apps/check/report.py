@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 
@@ -85,6 +85,11 @@ class Check(NamedTuple):
     """returns a note or nothing, and raises `CheckFailed`"""
     needs: tuple[str, ...] = ()
     """checks without which this one finds nothing new"""
+
+    @classmethod
+    def of(cls, method: Callable[[], str | None], *needs: str) -> Self:
+        """Return the check of a method, by the name of it in words."""
+        return cls(method.__name__.replace("_", " "), method, needs)
 
 
 def report(
