@@ -14,7 +14,6 @@ from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -53,12 +52,11 @@ from servobench.harness.run.resolution import (
     share_settings,
 )
 from servobench.harness.run.result import RunResult
-from servobench.harness.run.variations import ROLES
+from servobench.harness.run.variations import ROLES, Row
 from servobench.plant.contract.dependence import reasons_for_no_effect
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 
-Row = dict[str, Any]
 _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
 
 

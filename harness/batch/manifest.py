@@ -20,7 +20,7 @@ from servobench.harness.config.registry import (
     find_plant,
 )
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
-from servobench.harness.config.settings import flatten
+from servobench.harness.config.settings import Section, flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
 from servobench.harness.run.own_metrics import OwnMetric
 from servobench.harness.run.tasks import TASK_REGISTRY
@@ -48,8 +48,8 @@ def _seeds_word(seeds: range) -> str:
 
 def describe_batch(
     runs: Survey,
-    sections: Mapping[str, Any],
-    changed: Mapping[str, Any],
+    sections: Section,
+    changed: Section,
     side_by_side: Mapping[str, list[str]],
     own: Sequence[Offer] = (),
     *,
@@ -160,7 +160,7 @@ def describe_robot(name: str) -> dict[str, Any]:
 
 
 def named_files(
-    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]
+    runs: Survey, configuration: Mapping[str, Section], own: Iterable[Offer]
 ) -> dict[str, str]:
     """Return the SHA-256 of each file by its name, as the user wrote it.
 
@@ -183,7 +183,7 @@ def named_files(
 
 
 def _names(
-    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]
+    runs: Survey, configuration: Mapping[str, Section], own: Iterable[Offer]
 ) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
     yield from (read_word(name).robot for name in runs.robots)

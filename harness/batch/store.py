@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import pandas as pd
 import pyarrow as pa
@@ -28,6 +29,8 @@ from servobench.harness.run.result import RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
+
+Files: TypeAlias = dict[str, Callable[[Path], object]]  # name -> writes the file
 
 
 def create_folder(folder: Path, manifest: Manifest) -> None:
@@ -64,7 +67,7 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     """
     steps = [result.steps for result in outcome if result.steps is not None and len(result.steps)]
     failures = "".join(log_entry(result.row, result.trace) for result in outcome)
-    files: dict[str, Callable[[Path], object]] = {}
+    files: Files = {}
     if steps:
         frame = pa.Table.from_pandas(pd.concat(steps, ignore_index=True), preserve_index=False)
         files[part_name(index, STEPS)] = partial(
@@ -134,7 +137,7 @@ def put_together(folder: ResultsFolder, manifest: Manifest) -> int:
     if not folder.part_indices():
         folder.refuse_damaged([name for name in (RUNS, STEPS) if folder.expects(name)])
         raise ConfigurationError(f"{path} holds no finished run")
-    files: dict[str, Callable[[Path], object]] = {}
+    files: Files = {}
     for kind in (STEPS, FAILURES, RUNS):
         names = folder.part_names(kind)
         folder.refuse_damaged(names)

@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ import numpy as np
 
 from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
-from servobench.harness.config.settings import read_tuned
+from servobench.harness.config.settings import Section, read_tuned
 from servobench.harness.config.source import (
     SourceFile,
     code_digest,
@@ -416,7 +416,7 @@ class Own(Generic[Entry]):
     code: str = ""  # SHA-256 of the code and the modules beside it; empty where no file holds it
     tuned_path: Path = Path()  # the file of its tuned values, beside its code
     # Content of that file; empty for a controller that is not tuned
-    tuned: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    tuned: Section = field(default_factory=dict, compare=False)
 
     @property
     def name(self) -> str:
