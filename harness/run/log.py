@@ -61,6 +61,30 @@ class Steps:
     # (k,) for each number that the controller gave at least once; for one run only
     diagnostics: dict[str, FloatArray]
 
+    @classmethod
+    def unknown(cls, spec: PlantSpec, periods: int, lanes: tuple[int, ...] = ()) -> Steps:
+        """Return rows of which no number is known, of one run or of runs in lanes."""
+
+        def empty(*shape: int) -> FloatArray:
+            return np.full((periods, *lanes, *shape), np.nan)
+
+        return cls(
+            spec,
+            time=np.full(periods, np.nan),
+            reference=empty(spec.m),
+            feature=empty(spec.m),
+            true_feature=empty(spec.m),
+            joint_position=empty(spec.n),
+            command=empty(spec.n),
+            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
+            capture_time=empty(),
+            estimated_jacobian=empty(spec.m, spec.n),
+            true_jacobian=empty(spec.m, spec.n),
+            controller_time=np.full(periods, np.nan),
+            plant_time=np.full(periods, np.nan),
+            diagnostics={},
+        )
+
     def __len__(self) -> int:
         """Number of rows."""
         return len(self.time)
@@ -82,7 +106,7 @@ class Steps:
         """Return ‖Ĵ − J‖ / ‖J‖ (Frobenius), (k, ...)."""
         with np.errstate(all="ignore"):
             difference = norm(flat(self.estimated_jacobian - self.true_jacobian))
-            return np.asarray(difference / norm(flat(self.true_jacobian)))
+            return difference / norm(flat(self.true_jacobian))
 
     def jacobian_condition(self) -> FloatArray:
         """Return the largest over the smallest singular value of J, (k, ...); infinite where J has lost rank."""
@@ -141,27 +165,8 @@ class StepLog:
             periods: how many rows there is room for.
             lanes: the leading axes of runs side by side.
         """
-
-        def empty(*shape: int) -> FloatArray:
-            return np.full((periods, *lanes, *shape), np.nan)
-
         self._count = 0
-        self._rows = Steps(
-            spec,
-            time=np.full(periods, np.nan),
-            reference=empty(spec.m),
-            feature=empty(spec.m),
-            true_feature=empty(spec.m),
-            joint_position=empty(spec.n),
-            command=empty(spec.n),
-            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
-            capture_time=empty(),
-            estimated_jacobian=empty(spec.m, spec.n),
-            true_jacobian=empty(spec.m, spec.n),
-            controller_time=np.full(periods, np.nan),
-            plant_time=np.full(periods, np.nan),
-            diagnostics={},
-        )
+        self._rows = Steps.unknown(spec, periods, lanes)
 
     def add(self, period: Period, estimate: FloatArray | None, diagnostics: Diagnostics) -> None:
         """Write the next row.

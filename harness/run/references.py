@@ -260,7 +260,7 @@ class FollowedCurve(ImageReference):
         work = self.robot.workspace
         ratio = self.model.distance / work.camera_distance
         if self.robot.camera is None:
-            return np.asarray(ratio * self.curve.at(time))
+            return ratio * self.curve.at(time)
         image = self.robot.pinhole
         middle = work.centre
         pose = self.robot.camera_pose
@@ -271,4 +271,4 @@ class FollowedCurve(ImageReference):
         seen = min(image.width, image.height) / image.focal * CAMERA.focal / CAMERA.height
         about = self.curve.at(time) - (0.0, 0.0, work.camera_distance)
         shrunk = min(1.0, ratio * seen) * about
-        return np.asarray(shrunk + (middle - pose[:3, 3]) @ pose[:3, :3])
+        return shrunk + (middle - pose[:3, 3]) @ pose[:3, :3]

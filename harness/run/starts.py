@@ -153,9 +153,9 @@ def are_apart(postures: FloatArray, place: FloatArray, box: Box, setting: TaskSe
     if isinstance(setting.nominal, SetupModel):
         features = setting.nominal.feature(postures)
         least = box.shortest * setting.nominal.noise_unit
-        return np.asarray(norm(features - setting.nominal.feature(place)) >= least)
+        return norm(features - setting.nominal.feature(place)) >= least
     balls = robot.arm.ball_position(postures)
-    return np.asarray(norm(balls - robot.arm.ball_position(place)) >= box.shortest)
+    return norm(balls - robot.arm.ball_position(place)) >= box.shortest
 
 
 def stays_in_reach(target: FloatArray, box: Box, setting: TaskSetting) -> bool:
@@ -231,7 +231,7 @@ def _is_free(postures: FloatArray, box: Box, robot: Robot) -> BoolArray:
     free = robot.arm.ball_position(postures)[..., 2] >= box.lowest
     if robot.workspace.clear is not None:
         free &= robot.workspace.clear(postures)
-    return np.asarray(free)
+    return free
 
 
 def _in_view(postures: FloatArray, cameras: Cameras) -> BoolArray:
@@ -243,7 +243,7 @@ def _in_view(postures: FloatArray, cameras: Cameras) -> BoolArray:
     # Marks may be larger in a user's image.
     share = TRUE_SHARE if planned.planned == CAMERA else PLANNED_SHARE
     seen = true.valid_at(true.points(postures), share).all(axis=-1)
-    return np.asarray(foreseen & facing & seen)
+    return foreseen & facing & seen
 
 
 @settings
