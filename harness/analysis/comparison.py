@@ -99,13 +99,7 @@ class Difference:
     @cached_property
     def p_value(self) -> float:
         """Of the two-sided exact sign test that neither has less more often; a lost run is worst, ties are left out."""
-        from scipy import stats  # noqa: PLC0415 - as below
-
-        first_less, second_less = self.signs
-        if first_less + second_less == 0:
-            return 1.0
-        with np.errstate(under="ignore"):
-            return float(stats.binomtest(first_less, first_less + second_less).pvalue)
+        return _sign_test(*self.signs, "two-sided")
 
     @property
     def on_average(self) -> bool:
@@ -139,36 +133,41 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
     only_first_lost = int(np.count_nonzero(difference == np.inf))
     only_second_lost = int(np.count_nonzero(difference == -np.inf))
     lost_alike = abs(only_first_lost - only_second_lost) <= LOST_MARGIN * count
+    loses_more = is_majority(only_first_lost, only_second_lost)
+    loses_less = is_majority(only_second_lost, only_first_lost)
+    is_judged = mean.count >= MIN_PAIRS
     verdict: Verdict = "undecided"
-    told_by_lost = False
-    if is_majority(only_first_lost, only_second_lost):
+    if loses_more or (not loses_less and is_judged and mean.low > margin):
         verdict = "worse"
-        told_by_lost = True
-    elif is_majority(only_second_lost, only_first_lost):
+    elif loses_less or (is_judged and mean.high < -margin):
         verdict = "better"
-        told_by_lost = True
-    elif mean.count < MIN_PAIRS:
-        verdict = "undecided"
-    elif mean.low > margin or mean.high < -margin:
-        verdict = "worse" if mean.value > 0.0 else "better"
-    elif max(-mean.low, mean.high) <= margin and lost_alike:
+    elif is_judged and max(-mean.low, mean.high) <= margin and lost_alike:
         verdict = "equivalent"
     # P(first < second) + P(equal)/2 = 1/2 − E(sign)/2; a robot that both lose counts as equal.
     sign = np.where(np.isnan(difference), 0.0, np.sign(difference))
     probability = 0.5 - 0.5 * float(sign.sum()) / max(count, 1)
     signs = int((sign < 0.0).sum()), int((sign > 0.0).sum())
     lost = int(np.isinf(one).sum()), int(np.isinf(other).sum())
-    return Difference(mean, _wilson(probability, count), signs, lost, verdict, told_by_lost)
+    return Difference(
+        mean, _wilson(probability, count), signs, lost, verdict, loses_more or loses_less
+    )
 
 
 def is_majority(ones: int, others: int) -> bool:
     """Return whether a one-sided sign test at 5 % shows `ones` to be more frequent; of few, nothing is shown."""
     if ones + others < MIN_PAIRS:
         return False
+    return _sign_test(ones, others, "greater") < ALPHA
+
+
+def _sign_test(ones: int, others: int, alternative: Literal["two-sided", "greater"]) -> float:
+    """Return the p-value of an exact sign test; 1 where there are no signs."""
     from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
 
+    if ones + others == 0:
+        return 1.0
     with np.errstate(under="ignore"):
-        return bool(stats.binomtest(ones, ones + others, alternative="greater").pvalue < ALPHA)
+        return float(stats.binomtest(ones, ones + others, alternative=alternative).pvalue)
 
 
 def mean_with_interval(values: FloatArray) -> Estimate:
@@ -221,24 +220,13 @@ def median_with_interval(
     sample = _sample(given)
     if len(sample) == 0:
         raise ValueError("values must hold at least one number")
-    finite = np.isfinite(sample)
-    known = sample[finite] if finite.any() else np.zeros(1)
-    largest = float(known.max())
-
-    # Stand-ins above all finite values keep the order; a mean with one of them lies above, too.
-    stand_in = largest + 2.0 * (1.0 + float(np.ptp(known)))
-    sample = np.where(finite, sample, stand_in)
-
-    def restored(medians: FloatArray) -> FloatArray:
-        """Return medians with ∞ where a stand-in took part."""
-        return np.where(medians > largest, np.inf, medians)
-
-    value = float(restored(np.median(sample, keepdims=True))[0])
+    value = float(np.median(sample))
     if len(sample) == 1:
         return Estimate(value, np.nan, np.nan, 1)
     from scipy import stats  # noqa: PLC0415 - as above
 
-    with np.errstate(under="ignore"):  # scipy also takes a standard error, of numbers however small
+    # scipy also takes a standard error, of numbers however small and of infinite ones.
+    with np.errstate(under="ignore", invalid="ignore"):
         drawn = stats.bootstrap(
             (sample,),
             np.median,
@@ -247,7 +235,7 @@ def median_with_interval(
             method="percentile",
             rng=np.random.default_rng(0),
         )
-    medians = restored(np.sort(drawn.bootstrap_distribution))
+    medians = np.sort(drawn.bootstrap_distribution)
     # The ends are order statistics, as nothing lies between a number and infinity.
     cut = int((1.0 - CONFIDENCE) / 2.0 * RESAMPLES)
     return Estimate(value, float(medians[cut]), float(medians[-1 - cut]), len(sample))

@@ -8,9 +8,9 @@ import pandas as pd
 from servobench.controllers.aids import describe_aids
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
-from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.results import Manifest, ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS, FILES
-from servobench.harness.config.settings import tuned_settings
+from servobench.harness.config.settings import Section, tuned_settings
 from servobench.harness.config.source import find_place
 from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.result import COMPLETED
@@ -22,7 +22,7 @@ DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")
 TUNED: Final = "†"  # mark of a controller that a user tuned
 
 
-def describe_folder(manifest: Mapping[str, Any], runs: pd.DataFrame) -> dict[str, str]:
+def describe_folder(manifest: Manifest, runs: pd.DataFrame) -> dict[str, str]:
     """Return the facts of a folder: runs, controllers, plants, tasks, seeds and versions, as names and texts."""
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
@@ -35,7 +35,7 @@ def describe_folder(manifest: Mapping[str, Any], runs: pd.DataFrame) -> dict[str
     return facts
 
 
-def _made(manifest: Mapping[str, Any]) -> str:
+def _made(manifest: Manifest) -> str:
     """Return when and with which versions the runs of a manifest were made."""
     packages = manifest.get("packages") or {}
     created = manifest.get("created", "at an unknown time")
@@ -59,9 +59,7 @@ def titled_runs(folder: ResultsFolder) -> pd.DataFrame:
     return runs.assign(mismatch=runs["mismatch"].mask(drawn, FROM_TWIN))
 
 
-def describe_controllers(
-    manifest: Mapping[str, Any], names: Mapping[str, str] | None = None
-) -> str:
+def describe_controllers(manifest: Manifest, names: Mapping[str, str] | None = None) -> str:
     """Return one line that says which of several controllers have the aids; empty for a single one.
 
     Args:
@@ -84,7 +82,7 @@ def describe_controllers(
     return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
 
 
-def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> list[str]:
+def describe_tuning(manifest: Manifest, *, command: bool = True) -> list[str]:
     """Return a line for each controller that its user tuned, with budget and robots, and one about those not tuned.
 
     The latter only where others are tuned. Bounds, which know the true robot, and FMUs, whose values nobody knows, are
@@ -124,7 +122,7 @@ def describe_tuning(manifest: Mapping[str, Any], *, command: bool = True) -> lis
     return [*lines, line]
 
 
-def marked(names: Mapping[str, str], manifest: Mapping[str, Any]) -> dict[str, str]:
+def marked(names: Mapping[str, str], manifest: Manifest) -> dict[str, str]:
     """Return controllers with the names by which tables show them, and a mark where their user tuned them.
 
     The lines of `describe_tuning` explain it.
@@ -133,13 +131,13 @@ def marked(names: Mapping[str, str], manifest: Mapping[str, Any]) -> dict[str, s
     return {**names, **marks}
 
 
-def mark_tuned(runs: pd.DataFrame, manifest: Mapping[str, Any]) -> pd.DataFrame:
+def mark_tuned(runs: pd.DataFrame, manifest: Manifest) -> pd.DataFrame:
     """Return runs for tables, in which controllers that their user tuned are `marked`."""
     names = {name: name for name in manifest.get("tuned", {})}
     return runs.replace({"controller": marked(names, manifest)})
 
 
-def describe_settings(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+def describe_settings(configuration: Mapping[str, Section]) -> dict[str, str]:
     """Return every setting of the runs, given by section and name, as `section.name` and its text."""
     settings = {}
     for section, values in configuration.items():

@@ -13,6 +13,7 @@ from servobench.harness.analysis.folder import (
     describe_tuning,
 )
 from servobench.harness.analysis.tables import DIFFERENCE, Statistics, as_text
+from servobench.harness.batch.results import Manifest
 from servobench.harness.config.installation import short_commit
 from servobench.harness.run.outcome import FOLLOWED, SETTLED
 from servobench.harness.run.variations import varied_columns
@@ -131,7 +132,7 @@ def _heading(name: str, side: str) -> str:
 
 
 def methods_paragraph(
-    manifest: Mapping[str, Any],
+    manifest: Manifest,
     runs: pd.DataFrame,
     statistics: Statistics,
     names: Mapping[str, str],
@@ -161,9 +162,9 @@ def methods_paragraph(
     first = f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, {tools})"
     sentences = [
         _combinations(manifest, facts),
-        *_aids(manifest, names),
+        _aids(manifest, names),
         *describe_tuning(manifest, command=False),
-        *_varied(facts, shown),
+        _varied(facts, shown),
         _robots(facts, shown),
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
         "Differences are paired by robot, with Student's intervals (90 %) of their means; verdicts are those of a sign "
@@ -173,13 +174,13 @@ def methods_paragraph(
         "of the means (5 %)",
         _settings(manifest.get("changed")),
     ]
-    text = ". ".join([first, *(each.translate(SIGNS) for each in sentences)])
+    text = ". ".join([first, *(each.translate(SIGNS) for each in sentences if each)])
     year = str(manifest.get("created", ""))[:4].translate(SIGNS)
     entry = BIBTEX % (year, f"{version}, commit {commit}")
     return rf"\paragraph{{Methods}} {text}." + f"\n\n{entry}"
 
 
-def _used_libraries(manifest: Mapping[str, Any]) -> list[str]:
+def _used_libraries(manifest: Manifest) -> list[str]:
     """Return the numerical libraries and the engines with their versions, as far as known."""
     packages = manifest.get("packages") or {}
     libraries = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
@@ -187,7 +188,7 @@ def _used_libraries(manifest: Mapping[str, Any]) -> list[str]:
     return [*libraries, *map(str, engines.values())]
 
 
-def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
+def _combinations(manifest: Manifest, facts: Mapping[str, str]) -> str:
     """Return a sentence on controllers, tasks, plant, sensing and mismatch."""
     titles = [str(each.get("title")) for each in manifest.get("robots", [])]
     robots = ", ".join(titles) or "unknown robot"
@@ -197,12 +198,12 @@ def _combinations(manifest: Mapping[str, Any], facts: Mapping[str, str]) -> str:
     )
 
 
-def _aids(manifest: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
-    """Return a sentence on the aids of several controllers, by their names in tables; none for a single one."""
+def _aids(manifest: Manifest, names: Mapping[str, str]) -> str:
+    """Return a sentence on the aids of several controllers, by their names in tables; empty for a single one."""
     aids = describe_controllers(manifest, names)
     if not aids:
-        return []
-    return [f"Aids (stages around the law, which any controller can have): {aids}"]
+        return ""
+    return f"Aids (stages around the law, which any controller can have): {aids}"
 
 
 def _robots(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
@@ -213,15 +214,15 @@ def _robots(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
     return f"Every controller met the same {robots} (seeds {seeds}; {len(runs)} runs)"
 
 
-def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> list[str]:
-    """Return a sentence with the values of each setting that the runs vary; none if they vary none."""
+def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
+    """Return a sentence with the values of each setting that the runs vary; empty if they vary none."""
     varied = []
     for name, (heading, _) in varied_columns(runs.columns).items():
         if runs[name].nunique(dropna=False) > 1:
             varied.append(f"{heading} {facts[heading]}")
     if not varied:
-        return []
-    return [f"Varied: {'; '.join(varied)}"]
+        return ""
+    return f"Varied: {'; '.join(varied)}"
 
 
 def _settings(changed: Mapping[str, Any] | None) -> str:

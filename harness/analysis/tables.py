@@ -363,9 +363,8 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
     for (plant, mismatch, task), place in with_places(runs).groupby(
         ["plant", "mismatch", "task"], sort=False
     ):
-        kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
-        if (texts_of(place, "task_kind") == SEQUENCE).any():
-            kind = SEQUENCE
+        kinds = set(texts_of(place, "task_kind"))
+        kind = next((each for each in (SEQUENCE, CURVE) if each in kinds), POINT_TO_POINT)
         summaries = [
             (column, metric.summary)
             for wanted in (kind, None)  # measures of such tasks first
@@ -381,7 +380,10 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
                 _, factor = shown_unit(column, place)
                 values = column_of(own, column)
                 if column == "settling_time_s":
-                    values = _ends_of_settling(own)
+                    values = settling_times(own)
+                    # Runs that never settled count, unless all are such.
+                    if values.notna().any():
+                        values = values.fillna(math.inf)
                 middle = factor * values.median()
                 row[heading] = number(middle, f".{summary.digits}f")
                 if column == STEP_TIME and _is_late(own):
@@ -396,14 +398,6 @@ def _shares(runs: pd.DataFrame) -> str:
     if len(shares) == 1:
         return str(shares.index[0])
     return "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
-
-
-def _ends_of_settling(runs: pd.DataFrame) -> pd.Series[float]:
-    """Return settling times, s, with ∞ for runs that never settled; NaN throughout where none did."""
-    times = settling_times(runs)
-    if times.isna().all():
-        return times
-    return times.fillna(math.inf)
 
 
 def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
@@ -541,8 +535,7 @@ def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
     rows = _rows(runs.assign(outcome=outcomes(runs)), [*_varied(runs), "task"])
     mixed = [(row, own) for row, own in rows if not own["outcome"].isin(ACHIEVED).all()]
     found = {str(word) for _, own in mixed for word in own["outcome"]}
-    faults = sorted(found - set(OUTCOMES))
-    words = [*(word for word in OUTCOMES if word in found), *faults]
+    words = [*(word for word in OUTCOMES if word in found), *sorted(found - set(OUTCOMES))]
     table = []
     for row, own in mixed:
         row[WHICH, "runs"] = str(len(own))

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from itertools import islice
 from multiprocessing import current_process
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsIndex, TypeAlias
+from typing import NamedTuple, SupportsIndex, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,7 @@ from servobench.harness.batch.plan import (
     refuse_tuning_seeds,
 )
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.results import ResultsFolder, load_runs
+from servobench.harness.batch.results import Manifest, ResultsFolder, load_runs
 from servobench.harness.config.registry import (
     can_travel,
     choose_controller,
@@ -33,7 +33,7 @@ from servobench.harness.config.registry import (
     offered,
     offering,
 )
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Section, Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_seed
 from servobench.harness.run.resolution import check_settings
@@ -48,7 +48,7 @@ from servobench.plant.robot.mismatch import Mismatch
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry
-Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
+Sections: TypeAlias = Mapping[str, Section]
 
 
 class Results(NamedTuple):
@@ -58,7 +58,7 @@ class Results(NamedTuple):
     """a row a run"""
     steps: pd.DataFrame | None
     """a row a control period of each run; None if they were not kept"""
-    manifest: dict[str, Any]
+    manifest: Manifest
     """configuration, versions and seeds"""
 
 

@@ -187,7 +187,7 @@ def _outcome(
     try:
         answer = _received(future)
     except workers.lost:
-        answer = Answer([], End(Ending(CRASHED, LOST), certain=False))
+        answer = Answer([], _crash(LOST))
     match answer.items:
         case [{"unreadable": [str(status), str(reason), str(trace)]}] if status != COMPLETED:
             return [_failed(job, Ending(status, reason, trace)) for job in block.jobs], []
@@ -195,15 +195,14 @@ def _outcome(
     try:
         done.extend(_unpacked(block.jobs, answer.items))
     except (TypeError, ValueError, RecursionError) as error:
-        reason = f"the answer of the run cannot be read: {error}"
-        end = End(Ending(CRASHED, reason), certain=False)
+        end = _crash(f"the answer of the run cannot be read: {error}")
     if len(answer.items) > len(block.jobs):
         done.clear()
-        end = End(Ending(CRASHED, TALKATIVE), certain=False)
+        end = _crash(TALKATIVE)
     if len(done) == len(block.jobs):
         return done, []
     if end is None:
-        end = End(Ending(CRASHED, SILENT), certain=False)
+        end = _crash(SILENT)
     single = replace(block, together=False)
     if not done and len(block.jobs) > 1 and (block.together or workers.lost):
         return [], [single.part(at, at + 1) for at in range(len(block.jobs))]
@@ -212,6 +211,11 @@ def _outcome(
     if not end.certain and not block.fresh:  # a fresh block is one run, and its own second attempt
         return done, [single.part(at, at + 1, fresh=True), *rest]
     return [*done, _failed(block.jobs[at], end.ending)], rest
+
+
+def _crash(reason: str) -> End:
+    """Return the end of a run that may have suffered from an earlier one."""
+    return End(Ending(CRASHED, reason), certain=False)
 
 
 def _received(future: Future[Answer | bytes]) -> Answer:

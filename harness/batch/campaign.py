@@ -14,7 +14,6 @@ from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -37,7 +36,7 @@ from servobench.harness.batch.lock import check_empty, is_unused, locked
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.results import ResultsFolder, load_runs
+from servobench.harness.batch.results import Manifest, ResultsFolder, load_runs
 from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings
@@ -53,12 +52,11 @@ from servobench.harness.run.resolution import (
     share_settings,
 )
 from servobench.harness.run.result import RunResult
-from servobench.harness.run.variations import ROLES
+from servobench.harness.run.variations import ROLES, Row
 from servobench.plant.contract.dependence import reasons_for_no_effect
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 
-Row = dict[str, Any]
 _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
 
 
@@ -209,7 +207,7 @@ def _carry_out_at(
         store.put_together(opened, manifest)
 
 
-def _resume(folder: ResultsFolder, manifest: dict[str, Any], observer: Observer) -> None:
+def _resume(folder: ResultsFolder, manifest: Manifest, observer: Observer) -> None:
     """Refuse a folder of another batch, and mend one of this batch before anything is computed."""
     restored = restore_manifest(folder, manifest)
     check_same_batch(folder, manifest, observer.note, remedy="give another folder as `out`")

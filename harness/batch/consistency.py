@@ -6,9 +6,8 @@ has a row that fits it, and is not noticed.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -24,6 +23,7 @@ from servobench.harness.run.outcome import (
     SETTLED,
 )
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.variations import Row
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import COMMAND, PlantSpec
 
@@ -42,7 +42,7 @@ TOLERANCE: Final = 1e-9  # [1] by which two sums of the same terms may differ
 ANY: Final = 1e9  # [rad, rad/s] a limit that no metric above reads
 
 
-def find_contradiction(row: Mapping[str, Any], steps: pd.DataFrame | None, period: float) -> str:
+def find_contradiction(row: Row, steps: pd.DataFrame | None, period: float) -> str:
     """Return how the row of a run contradicts itself or its steps, as a clause; empty if it does not.
 
     Args:
@@ -59,7 +59,7 @@ def find_contradiction(row: Mapping[str, Any], steps: pd.DataFrame | None, perio
     return _find_beside(row, steps, period)
 
 
-def _find_within(row: Mapping[str, Any], period: float) -> str:
+def _find_within(row: Row, period: float) -> str:
     status = row["status"]
     outcome = row["outcome"]
     if status != COMPLETED:
@@ -92,14 +92,14 @@ def _find_within(row: Mapping[str, Any], period: float) -> str:
     return ""
 
 
-def _number(row: Mapping[str, Any], name: str) -> float:
+def _number(row: Row, name: str) -> float:
     value = row.get(name)
     if value is None:
         return math.nan
     return float(value)
 
 
-def _find_beside(row: Mapping[str, Any], steps: pd.DataFrame, period: float) -> str:
+def _find_beside(row: Row, steps: pd.DataFrame, period: float) -> str:
     if len(steps) != row["periods"]:
         return f"it has {row['periods']} periods and {len(steps)} steps"
     if steps.empty:
@@ -131,25 +131,19 @@ def _as_logged(steps: pd.DataFrame, band: float, period: float) -> Steps:
 
     true_feature = numbers("true_feature")
     command = numbers(COMMAND)
-    n = command.shape[1]
-    joints = tuple(map(str, range(n)))
+    joints = tuple(map(str, range(command.shape[1])))
     places = tuple(map(str, range(true_feature.shape[1])))
-    limit = np.full(n, ANY)
+    limit = np.full(len(joints), ANY)
     spec = PlantSpec.of_joints(joints, places, limit, -limit, limit, period)
-    unknown = np.full((len(steps), spec.m, n), np.nan)
-    return Steps(
-        replace(spec, feature=replace(spec.feature, tolerance=band)),
+    spec = replace(spec, feature=replace(spec.feature, tolerance=band))
+    return replace(
+        Steps.unknown(spec, len(steps)),
         time=steps["time_s"].to_numpy(np.float64),
         reference=numbers("reference"),
-        feature=true_feature,
         true_feature=true_feature,
         joint_position=numbers("joint_position"),
         command=command,
         feature_valid=steps["feature_valid"].to_numpy(np.bool_),
-        capture_time=unknown[:, 0, 0],
-        estimated_jacobian=unknown,
-        true_jacobian=unknown,
         controller_time=steps["controller_time_us"].to_numpy(np.float64),
         plant_time=steps["plant_time_us"].to_numpy(np.float64),
-        diagnostics={},
     )

@@ -1,11 +1,11 @@
 """In what two batches differ, by their manifests: in runs and settings, in files of users, in versions."""
 
 import json
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Final
 
 from servobench.harness.batch.manifest import OWN
-from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.results import Manifest, ResultsFolder
 from servobench.harness.batch.schema import encode
 from servobench.harness.config.settings import flatten
 from servobench.plant.contract.faults import ConfigurationError
@@ -24,7 +24,7 @@ SHOWN: Final = 60  # letters of a value that a message holds
 
 
 def check_same_batch(
-    folder: ResultsFolder, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str
+    folder: ResultsFolder, manifest: Manifest, note: Callable[[str], None], remedy: str
 ) -> None:
     """Refuse a folder of another batch than that of a manifest; `note` gets a line for each difference that may matter.
 
@@ -46,7 +46,7 @@ def check_same_batch(
             note(f"note: {folder.path} was begun with other {things}; later runs may differ")
 
 
-def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+def difference(there: Manifest, here: Manifest) -> str:
     """Return in which names or settings two batches differ that are not the same.
 
     Args:
@@ -65,7 +65,7 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     return "the settings or axes that are varied, or the command"
 
 
-def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+def changed_source(there: Manifest, here: Manifest) -> str:
     """Return the file of users that differs between two batches; empty if none does.
 
     Args:

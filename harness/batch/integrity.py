@@ -2,9 +2,9 @@
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from servobench.harness.batch import tables
 from servobench.harness.batch.lock import PARTS, refuse_links
@@ -13,6 +13,7 @@ from servobench.harness.batch.results import (
     PART,
     RUNS,
     STEPS,
+    Manifest,
     ResultsFolder,
     part_name,
 )
@@ -62,7 +63,7 @@ def examine(folder: ResultsFolder) -> Examination:
     check_resumable(folder)
     refuse_links(folder.path)
     findings: list[Finding] = []
-    manifest: dict[str, Any] = {}
+    manifest: Manifest = {}
     try:
         manifest = folder.manifest
     except OtherSchema:
@@ -128,7 +129,7 @@ def check_resumable(folder: ResultsFolder) -> None:
         _ = folder.manifest  # The error says why there is none.
 
 
-def mend(folder: ResultsFolder, manifest: Mapping[str, Any]) -> Iterator[str]:
+def mend(folder: ResultsFolder, manifest: Manifest) -> Iterator[str]:
     """Remove the damaged files of a folder whose batch is to go on, so that their runs count as missing.
 
     Args:
@@ -173,7 +174,7 @@ def mend(folder: ResultsFolder, manifest: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def restore_manifest(folder: ResultsFolder, manifest: dict[str, Any]) -> str:
+def restore_manifest(folder: ResultsFolder, manifest: Manifest) -> str:
     """Write a manifest anew that is damaged or missing, if all intact tables say that they are of that batch.
 
     Args:
@@ -222,7 +223,7 @@ class _Part:
     fault: str  # fault of that file; empty if there is none
 
 
-def _parts(folder: ResultsFolder, manifest: Mapping[str, Any]) -> Iterator[_Part]:
+def _parts(folder: ResultsFolder, manifest: Manifest) -> Iterator[_Part]:
     """Yield the parts of a folder, in order; where the manifest does not tell the batch, parts may be of any."""
     campaign = manifest.get("campaign")
     end = 0

@@ -1,14 +1,13 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
-from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.results import Manifest, ResultsFolder
 from servobench.harness.config.description import plain, restored
 from servobench.harness.config.registry import FILES
 from servobench.harness.config.settings import Settings, flatten, nest
@@ -111,7 +110,7 @@ def logged_in_folder(
     return resolve(request, _settings_of(request, manifest, own=not controller)), steps
 
 
-def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool) -> Settings:
+def _settings_of(request: RunRequest, manifest: Manifest, *, own: bool) -> Settings:
     """Return the settings with which a run was made, of its controller if that is its `own`.
 
     Those of the plant are the ones that the run did not have by default or by its mismatch.

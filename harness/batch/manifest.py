@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch.plan import Survey
+from servobench.harness.batch.schema import Manifest
 from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
 from servobench.harness.config.registry import (
     CONTROLLER_REGISTRY,
@@ -19,7 +20,7 @@ from servobench.harness.config.registry import (
     find_plant,
 )
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
-from servobench.harness.config.settings import flatten
+from servobench.harness.config.settings import Section, flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
 from servobench.harness.run.compiled import describe_compilation
 from servobench.harness.run.own_metrics import OwnMetric
@@ -51,13 +52,13 @@ def _seeds_word(seeds: range) -> str:
 
 def describe_batch(
     runs: Survey,
-    sections: Mapping[str, Any],
-    changed: Mapping[str, Any],
+    sections: Section,
+    changed: Section,
     side_by_side: Mapping[str, list[str]],
     own: Sequence[Offer] = (),
     *,
     steps: bool = False,
-) -> dict[str, Any]:
+) -> Manifest:
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
     Args:
@@ -119,21 +120,16 @@ def plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
         (PLANT_REGISTRY, runs.plants),
         (TASK_REGISTRY, runs.tasks),
     )
-    for name, point in (
-        (name, registry.published(name)) for registry, names in kinds for name in names
-    ):
-        if point is not None:
-            made = (
-                f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
-            )
-            yield (
-                name,
-                {
-                    "place": point.value,
-                    "distribution": made,
-                    "sha256": digest_of_module(point.module),
-                },
-            )
+    for registry, names in kinds:
+        for name in names:
+            point = registry.published(name)
+            if point is None:
+                continue
+            made = "unknown"
+            if point.dist is not None:
+                made = f"{point.dist.name} {point.dist.version}"
+            digest = digest_of_module(point.module)
+            yield name, {"place": point.value, "distribution": made, "sha256": digest}
 
 
 def describe_sensing(word: str) -> dict[str, Any]:
@@ -170,7 +166,7 @@ def describe_robot(name: str) -> dict[str, Any]:
 
 
 def named_files(
-    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]
+    runs: Survey, configuration: Mapping[str, Section], own: Iterable[Offer]
 ) -> dict[str, str]:
     """Return the SHA-256 of each file by its name, as the user wrote it.
 
@@ -183,25 +179,29 @@ def named_files(
     own = tuple(own)
     found = {name: user_path(name) for name in _names(runs, configuration, own)}
     for each in own:
-        found |= {} if each.given or not each.file else _code(each.place, Path(each.file))
+        if each.file and not each.given:
+            found |= _code(each.place, Path(each.file))
     for word in runs.sensings:
         source = sensing_file(word)
-        found |= {} if source is None else _code(sensing_place(word), source.path)
+        if source is not None:
+            found |= _code(sensing_place(word), source.path)
     return {name: digest(path) for name, path in found.items() if path.is_file()}
 
 
 def _names(
-    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]
+    runs: Survey, configuration: Mapping[str, Section], own: Iterable[Offer]
 ) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
     yield from (read_word(name).robot for name in runs.robots)
-    for camera in (find_robot(name).camera for name in runs.robots):
-        yield from () if camera is None else map(str, camera.files)
+    for name in runs.robots:
+        camera = find_robot(name).camera
+        if camera is not None:
+            yield from map(str, camera.files)
     yield from filter(None, (each.mismatch.calibration for each in runs.examples))
     for values in configuration.values():
-        yield from (
-            str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value
-        )
+        for key, value in values.items():
+            if key.split(".")[-1] == "file" and value:
+                yield str(value)
     for name in (*runs.plants, *runs.controllers, *(each.place for each in own)):
         if name.startswith(FILES):
             path = name.partition(":")[2]

@@ -77,7 +77,7 @@ def copy_parts(parts: Iterable[tuple[ResultsFolder, int]], other: Path) -> None:
         ConfigurationError: a file of them is damaged.
         UnwritableFolder: the other folder takes no more files.
     """
-    files: dict[str, Callable[[Path], object]] = {}
+    files: store.Files = {}
     for folder, index in parts:
         names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
         names = [name for name in names if folder.expects(name)]

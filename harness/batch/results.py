@@ -12,12 +12,12 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final, TypeAlias, final
 
 import pandas as pd
 import pyarrow.compute as pc
 
-from servobench.harness.batch import tables
+from servobench.harness.batch import schema, tables
 from servobench.harness.batch.lock import LOCK, PARTS, refuse_links
 from servobench.harness.batch.schema import MANIFEST, read_manifest
 from servobench.harness.batch.tables import (
@@ -31,6 +31,7 @@ from servobench.plant.contract.checksums import SUMS, Sums, append_sums, digest,
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL
 
+Manifest: TypeAlias = schema.Manifest
 PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
@@ -72,7 +73,7 @@ class ResultsFolder:
         self.added: dict[str, dict[str, float]] = {}
 
     @cached_property
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> Manifest:
         """The manifest, read and checked with the first question.
 
         Raises:

@@ -1,25 +1,28 @@
 """The schema of `manifest.json`: its version, its entries and their types; written as text, and read."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from servobench.harness.batch.tables import DamagedFile
 from servobench.harness.config.description import plain
 from servobench.plant.contract.faults import ConfigurationError
 
+Manifest: TypeAlias = dict[str, Any]  # its entries by name
 MANIFEST: Final = "manifest.json"
 SCHEMA_VERSION: Final = "4"
 # Since an earlier schema
 CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s [s]"}
-ENTRIES: Final[dict[str, tuple[type, ...]]] = {  # of a manifest: its type, and that of its elements
-    "created": (str,), "python": (str,), "platform": (str,), "campaign": (str,), "seeds": (str,), "run_count": (int,),
-    "plants": (list, str), "controllers": (list, str), "tasks": (list, str), "mismatches": (list, str),
-    "robots": (list, dict), "configuration": (dict, dict), "changed": (dict,), "own_controllers": (dict, dict),
-    "own_plants": (dict, dict), "own_tasks": (dict, dict), "own_metrics": (dict, dict), "plugins": (dict, dict),
-    "packages": (dict,), "engines": (dict,), "blas": (list, dict), "files": (dict, str), "side_by_side": (dict, list),
-    "tuned": (dict, dict),
+# Types of entries, and of their elements -> the keys of such entries
+ENTRIES: Final[dict[tuple[type, ...], tuple[str, ...]]] = {
+    (str,): ("created", "python", "platform", "campaign", "seeds"),
+    (int,): ("run_count",),
+    (dict,): ("changed", "packages", "engines"),
+    (list, str): ("plants", "controllers", "tasks", "mismatches"),
+    (list, dict): ("robots", "blas"),
+    (dict, str): ("files",),
+    (dict, list): ("side_by_side",),
+    (dict, dict): ("configuration", "own_controllers", "own_plants", "own_tasks", "own_metrics", "plugins", "tuned"),
 }  # fmt: skip
 WORDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
 SHOWN: Final = 60  # letters of a wrong value that a message holds
@@ -29,12 +32,12 @@ class OtherSchema(ConfigurationError):
     """A results folder is of another version of this package."""
 
 
-def encode(manifest: Mapping[str, Any]) -> str:
+def encode(manifest: Manifest) -> str:
     """Return a manifest as text; JSON has no infinity, so a setting without limit reads "inf"."""
     return json.dumps(plain({"schema_version": SCHEMA_VERSION, **manifest}), indent=2) + "\n"
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a folder.
 
     Raises:
@@ -53,11 +56,12 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
             f"{CHANGES.get(str(version), '')}; read it with the servobench that wrote it"
         )
-    for key, types in ENTRIES.items():
-        if key in manifest and not _has_type(manifest[key], *types):
-            wanted = " of ".join(WORDS[each] for each in types)
-            came = str(manifest[key])[:SHOWN]
-            raise DamagedFile(folder, MANIFEST, f"is damaged: {key} must be {wanted}, got {came!r}")
+    for types, keys in ENTRIES.items():
+        wanted = " of ".join(WORDS[each] for each in types)
+        for key in manifest.keys() & keys:
+            if not _has_type(manifest[key], *types):
+                came = f"{key} must be {wanted}, got {str(manifest[key])[:SHOWN]!r}"
+                raise DamagedFile(folder, MANIFEST, f"is damaged: {came}")
     return dict(manifest)
 
 

@@ -4,10 +4,10 @@ Each file is written atomically, with its checksum before it has its name; `resu
 """
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import pandas as pd
 import pyarrow as pa
@@ -19,6 +19,7 @@ from servobench.harness.batch.results import (
     PICTURES,
     RUNS,
     STEPS,
+    Manifest,
     ResultsFolder,
     part_name,
 )
@@ -29,8 +30,10 @@ from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_v
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
 
+Files: TypeAlias = dict[str, Callable[[Path], object]]  # name -> writes the file
 
-def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
+
+def create_folder(folder: Path, manifest: Manifest) -> None:
     """Make a new results folder with its manifest, also where an earlier call could not.
 
     Raises:
@@ -45,7 +48,7 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
         write_manifest(folder, manifest)
 
 
-def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write `manifest.json`."""
     write_vouched(folder, {MANIFEST: _text(encode(manifest))})
 
@@ -64,7 +67,7 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     """
     steps = [result.steps for result in outcome if result.steps is not None and len(result.steps)]
     failures = "".join(log_entry(result.row, result.trace) for result in outcome)
-    files: dict[str, Callable[[Path], object]] = {}
+    files: Files = {}
     if steps:
         frame = pa.Table.from_pandas(pd.concat(steps, ignore_index=True), preserve_index=False)
         files[part_name(index, STEPS)] = partial(
@@ -92,7 +95,7 @@ def _write_picture(path: Path, result: RunResult) -> None:
     write_atomically(path, lambda file: file.write_bytes(content))
 
 
-def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: dict[str, Any]) -> None:
+def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: Manifest) -> None:
     """Make a folder that holds several sweeps a results folder itself: one table of all their runs.
 
     Args:
@@ -124,7 +127,7 @@ def collect(folder: ResultsFolder) -> int:
     return put_together(folder, folder.manifest)
 
 
-def put_together(folder: ResultsFolder, manifest: Mapping[str, Any]) -> int:
+def put_together(folder: ResultsFolder, manifest: Manifest) -> int:
     """Put the parts of a folder with this manifest together; result and errors are those of `collect`."""
     path = folder.path
     wanted = manifest.get("run_count", 0)
@@ -134,7 +137,7 @@ def put_together(folder: ResultsFolder, manifest: Mapping[str, Any]) -> int:
     if not folder.part_indices():
         folder.refuse_damaged([name for name in (RUNS, STEPS) if folder.expects(name)])
         raise ConfigurationError(f"{path} holds no finished run")
-    files: dict[str, Callable[[Path], object]] = {}
+    files: Files = {}
     for kind in (STEPS, FAILURES, RUNS):
         names = folder.part_names(kind)
         folder.refuse_damaged(names)

@@ -4,7 +4,7 @@ import contextlib
 import errno
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from servobench.harness.run.metrics import BUILT_IN
 from servobench.harness.run.result import COMPLETED
-from servobench.harness.run.variations import SHORT_NAMES
+from servobench.harness.run.variations import SHORT_NAMES, Row
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -82,7 +82,7 @@ def sums_of(folder: Path) -> Sums | None:
         ) from error
 
 
-def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
+def as_table(rows: Sequence[Row]) -> pa.Table:
     """Return rows as a table with the columns of all; NaN is null, and an empty column of numbers is one of numbers."""
 
     def column(name: str, values: Sequence[Any]) -> pa.Array:

@@ -12,9 +12,10 @@ from rich import progress
 from rich.console import Console
 from rich.text import Text
 
-from servobench.harness.batch.campaign import Execution, Observer, Row
+from servobench.harness.batch.campaign import Execution, Observer
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.cli.terminal import end_interrupted
+from servobench.harness.run.variations import Row
 from servobench.plant.contract.files import harmless
 
 MANY_RUNS: Final = 10_000  # from which on their number and time are told first

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -28,7 +29,7 @@ from servobench.plant.contract.faults import ConfigurationError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from servobench.harness.batch.results import ResultsFolder
+    from servobench.harness.batch.results import Manifest, ResultsFolder
 
 MAX_SATURATED: Final = 0.8  # share of the periods
 MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
@@ -62,12 +63,7 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.folder import (
-        describe_controllers,
-        describe_tuning,
-        marked,
-        titled_runs,
-    )
+    from servobench.harness.analysis.folder import marked, titled_runs
     from servobench.harness.analysis.latex import latex_tables, methods_paragraph
     from servobench.harness.analysis.tables import Selection, as_plain, judge_places
     from servobench.harness.batch.measuring import add_metric
@@ -116,8 +112,7 @@ def statistics(
     else:
         print_tables(found.tables())
     say(found.legend)
-    say(describe_controllers(opened.manifest, labels))
-    say("\n".join(describe_tuning(opened.manifest)))
+    say_methods(opened.manifest, labels)
 
 
 def collect(
@@ -157,6 +152,14 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     if found.findings:
         sys.exit(FAILED)
     say(f"{found.files} files are as they were written, {found.runs} runs")
+
+
+def say_methods(manifest: Manifest, names: Mapping[str, str] | None = None) -> None:
+    """Print which controllers of a folder have the aids, and which were tuned; `names` are those that tables show."""
+    from servobench.harness.analysis.folder import describe_controllers, describe_tuning
+
+    say(describe_controllers(manifest, names))
+    say("\n".join(describe_tuning(manifest)))
 
 
 def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:

@@ -20,7 +20,7 @@ from servobench.harness.cli.options import (
     option,
     switch,
 )
-from servobench.harness.cli.results import judge, print_faults
+from servobench.harness.cli.results import judge, print_faults, say_methods
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest
@@ -175,8 +175,6 @@ def sweep(
     """
     from servobench.harness.analysis.comparison import MISSING
     from servobench.harness.analysis.folder import (
-        describe_controllers,
-        describe_tuning,
         mark_tuned,
     )
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, outcome_legend, sweep_tables
@@ -203,8 +201,7 @@ def sweep(
     legend = f"{outcomes}\n{MISSING} as configured".lstrip()
     parts = (mark_tuned(part, folder.manifest) for part in folder.iterate_runs(columns))
     print_tables(sweep_tables(parts), legend)
-    say(describe_controllers(folder.manifest))
-    say("\n".join(describe_tuning(folder.manifest)))
+    say_methods(folder.manifest)
     say(f"table in {out / RUNS}")
     judge(folder, strict=running.strict, whole=execution.part == (1, 1))
 
@@ -276,8 +273,6 @@ def _carry_out(
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
     from servobench.harness.analysis.folder import (
-        describe_controllers,
-        describe_tuning,
         mark_tuned,
         titled_runs,
     )
@@ -295,8 +290,7 @@ def _carry_out(
         runs = titled_runs(opened)
         shown = mark_tuned(runs, opened.manifest)
         print_tables(summary_tables(shown), summary_legend(runs))
-        say(describe_controllers(opened.manifest))
-        say("\n".join(describe_tuning(opened.manifest)))
+        say_methods(opened.manifest)
         print_faults(opened, runs)
         if out is None:
             point_latest(folder)

@@ -42,20 +42,9 @@ def names_of(kind: Kind) -> Names:
         return kind()
     match kind:
         case "plants":
-            from servobench.harness.batch import trials
-            from servobench.harness.config.registry import plant_names
-
-            return Names(plant_names, partial(trials.choose, "plant"), "plant")
+            return _tried("plant")
         case "controllers":
-            from servobench.harness.batch import trials
-            from servobench.harness.config.registry import controller_names
-
-            return Names(
-                controller_names,
-                partial(trials.choose, "controller"),
-                "controller",
-                _begun_controllers,
-            )
+            return _tried("controller")._replace(begun=_begun_controllers)
         case "estimators":
             from servobench.controllers.methods import ESTIMATORS
 
@@ -77,6 +66,13 @@ def names_of(kind: Kind) -> Names:
 
             return Names(sensing_names, accepted(find_sensing))
     raise ValueError(f"kind must be plants, controllers or another kind of names, got {kind!r}")
+
+
+def _tried(word: Word) -> Names:
+    from servobench.harness.batch import trials
+    from servobench.harness.config.registry import REGISTRIES
+
+    return Names(REGISTRIES[word].names, partial(trials.choose, word), word)
 
 
 def _begun_controllers(word: str) -> Iterable[str]:

@@ -11,10 +11,11 @@ import contextlib
 import hashlib
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import partial
+from inspect import Parameter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Generic, Protocol, TypeVar, get_type_hints
@@ -23,7 +24,7 @@ import numpy as np
 
 from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
-from servobench.harness.config.settings import read_tuned
+from servobench.harness.config.settings import Section, read_tuned
 from servobench.harness.config.source import (
     SourceFile,
     code_digest,
@@ -356,15 +357,10 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
         parameters = list(inspect.signature(kind).parameters.values())
     except (TypeError, ValueError):  # compiled code has no signature
         return None
-    positional = [
-        each
-        for each in parameters
-        if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)
-    ]
-    needed = [each for each in positional if each.default is each.empty]
-    only_by_name = [
-        each for each in parameters if each.kind is each.KEYWORD_ONLY and each.default is each.empty
-    ]
+    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    required = [each for each in parameters if each.default is each.empty]
+    needed = [each for each in required if each.kind in positional]
+    only_by_name = any(each.kind is each.KEYWORD_ONLY for each in required)
     must = f"{_class_place(kind)}: {kind.__name__}.__init__ must"
     if len(needed) > 2 or only_by_name or not parameters:
         got = ", ".join(["self", *(each.name for each in parameters)])
@@ -420,7 +416,7 @@ class Own(Generic[Entry]):
     code: str = ""  # SHA-256 of the code and the modules beside it; empty where no file holds it
     tuned_path: Path = Path()  # the file of its tuned values, beside its code
     # Content of that file; empty for a controller that is not tuned
-    tuned: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    tuned: Section = field(default_factory=dict, compare=False)
 
     @property
     def name(self) -> str:

@@ -14,6 +14,7 @@ import contextlib
 import weakref
 from collections.abc import Mapping
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Final, final
 
@@ -49,12 +50,13 @@ from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
     "outputs": "joint_velocity_command",
+    "jacobian": "jacobian",
     "joints": "joint_position",
     "features": "feature",
-    "reference": "reference",
     "seen": "seen",
-    "jacobian": "jacobian",
+    "reference": "reference",
 }
+INPUTS: Final = ("joints", "features", "seen", "reference")  # roles in the order of their values
 
 
 @settings
@@ -102,11 +104,10 @@ class FmuController(Controller):
         self._setters = setters(self._description, mapping.parameters)
         self._instance = open_instance(self._description, mapping.tolerance, mapping.debug_log)
         weakref.finalize(self, self._instance.close)
-        roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
-        self._given = tuple(bool(names) for names in roles)
-        self._inputs = Port(
-            self._description.select([name for names in roles for name in names], "inputs", NUMERIC)
-        )
+        roles: tuple[Names, ...] = tuple(getattr(mapping, role) for role in INPUTS)
+        self._given = tuple(map(bool, roles))
+        names = list(chain.from_iterable(roles))
+        self._inputs = Port(self._description.select(names, "inputs", NUMERIC))
         self._outputs = Port(
             self._description.select((*mapping.outputs, *mapping.jacobian), "outputs", NUMERIC)
         )
@@ -121,28 +122,19 @@ class FmuController(Controller):
     def _check(self, mapping: ControllerMapping, preview: int, feature_unit: str) -> int:
         """Return how many rows of the reference it takes, and refuse sizes and units that do not fit."""
         (m, n), file = self._shape, self._description.path.name
-        roles = ("outputs", "features", "joints", "seen", "jacobian", "reference")
+        sizes = {"outputs": n, "jacobian": m * n, "joints": n, "features": m, "seen": m}
         found = {
-            role: self._description.select(getattr(mapping, role), role, NUMERIC) for role in roles
+            role: self._description.select(getattr(mapping, role), role, NUMERIC)
+            for role in CONVENTION
         }
-        for role, size in (
-            ("outputs", n),
-            ("features", m),
-            ("joints", n),
-            ("seen", m),
-            ("jacobian", m * n),
-        ):
+        for role, size in sizes.items():
             came = total_size(found[role])
             if found[role] and came != size:
                 raise ValueError(
                     f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}"
                 )
-        given = {role: found[role] for role in ("joints", "features", "seen", "reference")}
-        check_roles(
-            {"outputs": found["outputs"], "jacobian": found["jacobian"], **given},
-            given,
-            self._description,
-        )
+        given = {role: found[role] for role in INPUTS}
+        check_roles(found, given, self._description)
         values = self._description.select(mapping.parameters, "parameters", None)
         check_roles({**given, "parameters": values}, (), self._description)
         units = {
@@ -154,12 +146,12 @@ class FmuController(Controller):
         for role, unit in units.items():
             check_unit(role, found[role], unit, any_quantity=role in ("features", "reference"))
         taken = {variable.name for variables in given.values() for variable in variables}
-        inputs = [
+        idle = [
             variable.name
             for variable in self._description.variables
-            if variable.causality == "input"
+            if variable.causality == "input" and variable.name not in taken
         ]
-        if idle := [name for name in inputs if name not in taken]:
+        if idle:
             remark(
                 f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value"
             )

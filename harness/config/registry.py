@@ -328,10 +328,9 @@ def is_foreign_controller(name: str) -> bool:
 
 def own_modules(plants: Iterable[str], controllers: Iterable[str]) -> tuple[str, ...]:
     """Return the modules of this package in which plants and controllers are, as far as they have one of their own."""
-    values = [PLANTS.get(name) for name in plants] + [
-        NOT_COMPOSED.get(name) for name in controllers
-    ]
-    return tuple(value.partition(":")[0] for value in values if value is not None)
+    places = PLANTS | NOT_COMPOSED
+    known = [places[name] for name in (*plants, *controllers) if name in places]
+    return tuple(place.partition(":")[0] for place in known)
 
 
 def _split_alias(given: str) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.source import show
@@ -27,6 +27,7 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.files import is_file, parse_toml, read_toml
 from servobench.plant.contract.settings import override, remark
 
+Section: TypeAlias = Mapping[str, Any]  # settings by nested or dotted keys
 Config = TypeVar("Config")
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 TUNING_WORDS: Final = f"{TUNING.start}:{TUNING.stop}"
@@ -55,7 +56,7 @@ class Settings:
         ConfigurationError: something else than sections with keys.
     """
 
-    sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    sections: Mapping[str, Section] = field(default_factory=dict)
     assigned: tuple[Assignment, ...] = ()
     filed: frozenset[tuple[str, str]] = frozenset()
 
@@ -87,7 +88,7 @@ def _is_section(given: object) -> bool:
     )
 
 
-def _undotted(section: Mapping[str, Any]) -> Mapping[str, Any]:
+def _undotted(section: Section) -> Section:
     """Return a section with nested keys in place of dotted ones."""
     dotted = [key for key in section if "." in key]
     for key in dotted:
@@ -144,7 +145,7 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - 
     return flat
 
 
-def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+def nest(flat: Section) -> dict[str, Any]:
     """Return settings by nested keys, given those by dotted key; None, a setting without a value, is left out."""
     nested: dict[str, Any] = {}
     for key, value in flat.items():
@@ -212,7 +213,7 @@ def default_config(entry: ControllerEntry, *, model_known: bool = True) -> Any: 
     return apply_settings(entry, tuned if model_known else _without_model(entry, tuned))
 
 
-def _without_model(entry: ControllerEntry, tuned: Mapping[str, Any]) -> Mapping[str, Any]:
+def _without_model(entry: ControllerEntry, tuned: Section) -> Section:
     """Return the tuned values that hold where no model is known; those of a published method never counted on one."""
     if entry.needs_truth or not hasattr(entry.config(), "initial"):
         return tuned
@@ -220,7 +221,7 @@ def _without_model(entry: ControllerEntry, tuned: Mapping[str, Any]) -> Mapping[
     return kept | {"initial": {"source": "probe"}}
 
 
-def apply_settings(entry: ControllerEntry, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - as default_config
+def apply_settings(entry: ControllerEntry, values: Section) -> Any:  # noqa: ANN401 - as default_config
     """Return the configuration of `entry`'s class with nested `values` on top.
 
     Raises:
@@ -230,7 +231,7 @@ def apply_settings(entry: ControllerEntry, values: Mapping[str, Any]) -> Any:  #
 
 
 @cache
-def tuned_settings(name: str) -> Mapping[str, Any]:
+def tuned_settings(name: str) -> Section:
     """Return the tuned values of the controller called `name`, nested; empty where there are none.
 
     Raises:
@@ -250,7 +251,7 @@ def tuned_settings(name: str) -> Mapping[str, Any]:
     return values
 
 
-def read_tuned(path: Path, entry: ControllerEntry, place: str, code: str) -> Mapping[str, Any]:
+def read_tuned(path: Path, entry: ControllerEntry, place: str, code: str) -> Section:
     """Return the content of a file of tuned values; empty where there is none, or where the code was edited since.
 
     Args:

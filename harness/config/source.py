@@ -293,7 +293,7 @@ def digest_of_module(module: str) -> str:
     """Return the SHA-256 of the file of a module that is imported; empty where it has none."""
     file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
     if file.is_file():
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        return digest(file)
     return ""
 
 

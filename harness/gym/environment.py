@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Section, Settings
 from servobench.harness.run.experiment import Experiment, build, build_together
 from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.lanes import side_by_side_key
@@ -179,7 +179,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         mismatch: str = "moderate",
         robot: str = DEFAULT_ROBOT,
         sensing: str = DEFAULT_SENSING,
-        settings: Mapping[str, Mapping[str, Any]] | None = None,
+        settings: Mapping[str, Section] | None = None,
         render_mode: str | None = None,
         **others: object,
     ) -> None:

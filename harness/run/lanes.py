@@ -21,7 +21,7 @@ from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import Lanes, Tree, map_arrays, take
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 
 LaneIndex = npt.NDArray[np.intp]
 
@@ -238,7 +238,7 @@ class ManyLogs(StepLog):
         super().__init__(spec, periods, (ends.count,))
         self._ends = ends
 
-    def end(self, lanes: npt.NDArray[np.bool_], fault: Exception) -> None:
+    def end(self, lanes: BoolArray, fault: Exception) -> None:
         """End the runs in the lanes."""
         for lane in np.flatnonzero(lanes):
             self._ends.end(int(lane), fault, self._count)

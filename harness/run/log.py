@@ -12,13 +12,19 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.controller import Diagnostics
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.lanes import norm
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, column_names
+from servobench.plant.contract.signals import (
+    BoolArray,
+    Command,
+    Observation,
+    PlantSpec,
+    Truth,
+    column_names,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,7 +51,7 @@ class Steps:
     true_feature: FloatArray  # (k, ..., m) [unit of the feature]
     joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
     command: FloatArray  # (k, ..., n) [rad/s]
-    feature_valid: npt.NDArray[np.bool_]  # (k, ...), whether a measurement arrived
+    feature_valid: BoolArray  # (k, ...), whether a measurement arrived
     capture_time: FloatArray  # (k, ...), exposure of the last one by the camera's clock [s]
     # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
     estimated_jacobian: FloatArray
@@ -54,6 +60,30 @@ class Steps:
     plant_time: FloatArray  # (k,) [µs]
     # (k,) for each number that the controller gave at least once; for one run only
     diagnostics: dict[str, FloatArray]
+
+    @classmethod
+    def unknown(cls, spec: PlantSpec, periods: int, lanes: tuple[int, ...] = ()) -> Steps:
+        """Return rows of which no number is known, of one run or of runs in lanes."""
+
+        def empty(*shape: int) -> FloatArray:
+            return np.full((periods, *lanes, *shape), np.nan)
+
+        return cls(
+            spec,
+            time=np.full(periods, np.nan),
+            reference=empty(spec.m),
+            feature=empty(spec.m),
+            true_feature=empty(spec.m),
+            joint_position=empty(spec.n),
+            command=empty(spec.n),
+            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
+            capture_time=empty(),
+            estimated_jacobian=empty(spec.m, spec.n),
+            true_jacobian=empty(spec.m, spec.n),
+            controller_time=np.full(periods, np.nan),
+            plant_time=np.full(periods, np.nan),
+            diagnostics={},
+        )
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -76,7 +106,7 @@ class Steps:
         """Return ‖Ĵ − J‖ / ‖J‖ (Frobenius), (k, ...)."""
         with np.errstate(all="ignore"):
             difference = norm(flat(self.estimated_jacobian - self.true_jacobian))
-            return np.asarray(difference / norm(flat(self.true_jacobian)))
+            return difference / norm(flat(self.true_jacobian))
 
     def jacobian_condition(self) -> FloatArray:
         """Return the largest over the smallest singular value of J, (k, ...); infinite where J has lost rank."""
@@ -135,27 +165,8 @@ class StepLog:
             periods: how many rows there is room for.
             lanes: the leading axes of runs side by side.
         """
-
-        def empty(*shape: int) -> FloatArray:
-            return np.full((periods, *lanes, *shape), np.nan)
-
         self._count = 0
-        self._rows = Steps(
-            spec,
-            time=np.full(periods, np.nan),
-            reference=empty(spec.m),
-            feature=empty(spec.m),
-            true_feature=empty(spec.m),
-            joint_position=empty(spec.n),
-            command=empty(spec.n),
-            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
-            capture_time=empty(),
-            estimated_jacobian=empty(spec.m, spec.n),
-            true_jacobian=empty(spec.m, spec.n),
-            controller_time=np.full(periods, np.nan),
-            plant_time=np.full(periods, np.nan),
-            diagnostics={},
-        )
+        self._rows = Steps.unknown(spec, periods, lanes)
 
     def add(self, period: Period, estimate: FloatArray | None, diagnostics: Diagnostics) -> None:
         """Write the next row.
@@ -190,7 +201,7 @@ class StepLog:
             rows.diagnostics[name][k] = value
         self._count += 1
 
-    def end(self, lanes: npt.NDArray[np.bool_], fault: RunFault) -> None:
+    def end(self, lanes: BoolArray, fault: RunFault) -> None:
         """End the run for a fault that the loop found; runs side by side end those in the lanes.
 
         Raises:

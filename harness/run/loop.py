@@ -19,7 +19,6 @@ from time import perf_counter_ns
 from typing import Any, NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import Period, StepLog
@@ -29,7 +28,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.seeds import Seeds, named_seed
-from servobench.plant.contract.signals import Command, Observation
+from servobench.plant.contract.signals import BoolArray, Command, Observation
 
 
 class CameraMove(NamedTuple):
@@ -101,7 +100,7 @@ class Rollout:
         self.observation = self.plant.step(command)
         self._lost = (1 + self._lost) * (1 - self.observation.feature_valid)
 
-    def lost(self) -> npt.NDArray[np.bool_] | None:
+    def lost(self) -> BoolArray | None:
         """Return the runs, (...), that had no valid feature for too long; None if there are none."""
         if np.max(self._lost) < self.settings.lost_after_periods:
             return None

@@ -253,7 +253,7 @@ def _median_time(run: Judged, moves: slice) -> FloatArray:
     times = run.move_times[..., moves]
     if not times.shape[-1]:
         return run.same(math.nan)
-    return np.asarray(np.median(times, axis=-1))
+    return np.median(times, axis=-1)
 
 
 def _saturation(run: Judged) -> FloatArray:
@@ -292,7 +292,7 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
     """Return the mean or maximum over periods, (...), of those values (..., k) that are not NaN; NaN without any."""
     unknown = np.isnan(values)
     if not unknown.any():
-        return np.asarray(summary(values, axis=-1))
+        return summary(values, axis=-1)
     summaries = []
     for row in values.reshape(-1, values.shape[-1]):
         known = row[~np.isnan(row)]

@@ -228,21 +228,8 @@ class ImageReference(Reference):
 
 @final
 @dataclass(frozen=True, eq=False)
-class TaughtImage(ImageReference):
-    """The target where it is with the arm at given joint positions."""
-
-    joint_position: FloatArray  # (n,) [rad]
-
-    def points(self, time: npt.ArrayLike) -> FloatArray:
-        """Return the same place at all times."""
-        points = self.model.points(self.joint_position)
-        return np.broadcast_to(points, (*np.shape(time), *points.shape)).copy()
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class LedImage(ImageReference):
-    """The target where it is while the arm is led along a path."""
+    """The target where it is while the arm is led along a path, or rests where it was taught."""
 
     path: JointPath
 
@@ -273,7 +260,7 @@ class FollowedCurve(ImageReference):
         work = self.robot.workspace
         ratio = self.model.distance / work.camera_distance
         if self.robot.camera is None:
-            return np.asarray(ratio * self.curve.at(time))
+            return ratio * self.curve.at(time)
         image = self.robot.pinhole
         middle = work.centre
         pose = self.robot.camera_pose
@@ -284,4 +271,4 @@ class FollowedCurve(ImageReference):
         seen = min(image.width, image.height) / image.focal * CAMERA.focal / CAMERA.height
         about = self.curve.at(time) - (0.0, 0.0, work.camera_distance)
         shrunk = min(1.0, ratio * seen) * about
-        return np.asarray(shrunk + (middle - pose[:3, 3]) @ pose[:3, :3])
+        return shrunk + (middle - pose[:3, 3]) @ pose[:3, :3]

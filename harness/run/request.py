@@ -160,9 +160,7 @@ class RunRequest:
         A varied setting is a column: that of its short name, or its key.
         """
         varied = dict(self.varied)
-        short = {}
-        for each in SHORT_NAMES.values():
-            short[each.column] = varied.pop(each.key, each.usual)
+        short = {each.column: varied.pop(each.key, each.usual) for each in SHORT_NAMES.values()}
         others = {}
         for key, value in varied.items():
             others[key] = json.dumps(value) if isinstance(value, tuple) else value

@@ -1,6 +1,6 @@
 """A request with all its settings as typed values: names looked up and texts read once a batch."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from operator import attrgetter
 from typing import Any, Final
@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from servobench.harness.config import registry
-from servobench.harness.config.settings import Settings, default_config, flatten, nest
+from servobench.harness.config.settings import Section, Settings, default_config, flatten, nest
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
@@ -34,9 +34,7 @@ class Sections(dict[str, Any]):
         given: their dotted keys by section, but for defaults that a file repeats.
     """
 
-    def __init__(
-        self, sections: Mapping[str, Any], user: Settings, defaults: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, sections: Section, user: Settings, defaults: Section) -> None:
         """Keep settings by section."""
         super().__init__(sections)
         self.user, self.given = user, dict[str, frozenset[str]]()
@@ -244,7 +242,7 @@ def share_settings(one: RunRequest, other: RunRequest) -> bool:
     return one.robot in ROBOTS and _BUT_SEED(one) == _BUT_SEED(other)
 
 
-def _drawn_times(twin: Twin, usual: Mapping[str, Any], seed: int) -> Varied:
+def _drawn_times(twin: Twin, usual: Section, seed: int) -> Varied:
     """Return the times of a twin's run that differ from those of its mean, but for times that a user has set."""
     mean = twin.times(0)
     return tuple(

@@ -11,13 +11,14 @@ import ctypes
 import inspect
 import mmap
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from servobench.harness.config.source import PACKAGE_FOLDER, is_users
+from servobench.harness.run.variations import Row
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.files import harmless
 
@@ -92,7 +93,7 @@ class RunResult:
     trace: str = ""
 
     @classmethod
-    def failed(cls, identity: Mapping[str, Any], ending: Ending) -> RunResult:
+    def failed(cls, identity: Row, ending: Ending) -> RunResult:
         """Return the result of a run of which only the columns of its request and its ending are known."""
         known = {
             "status": ending.status,
@@ -108,7 +109,7 @@ def ends_batch(error: BaseException) -> bool:
     return isinstance(error, KeyboardInterrupt) and parent_process() is None
 
 
-def log_entry(row: Mapping[str, Any], trace: str) -> str:
+def log_entry(row: Row, trace: str) -> str:
     """Return the entry of a run in the log of failures; empty for one that completed.
 
     Args:
@@ -122,12 +123,15 @@ def log_entry(row: Mapping[str, Any], trace: str) -> str:
     return "\n".join(lines)
 
 
-class _Place(NamedTuple):
+class Place(NamedTuple):
+    """A line of code."""
+
     file: str
     line: int
     function: str
 
     def __str__(self) -> str:
+        """Return it as reasons have it."""
         return f"{Path(self.file).name}:{self.line} in {self.function}"
 
 
@@ -142,45 +146,40 @@ def _behind(error: BaseException) -> BaseException:
     return error
 
 
-def _place(error: BaseException) -> _Place | None:
+def _place(error: BaseException) -> Place | None:
     """Return the place of the defect; None for a fault that this package raised."""
     if isinstance(error, WrongAnswer):
-        return _beginning(error.method)
+        return beginning(error.method)
     frames = list(traceback.walk_tb(error.__traceback__))
     own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
     if not own and not isinstance(error, RunFault):
-        ours = [
-            each
-            for each in frames
-            if Path(each[0].f_code.co_filename).is_relative_to(PACKAGE_FOLDER)
-        ]
         own = [
-            each
-            for each in ours
-            if each[0].f_globals.get("__name__") != ConfigurationError.__module__
+            (frame, line)
+            for frame, line in frames
+            if Path(frame.f_code.co_filename).is_relative_to(PACKAGE_FOLDER)
+            and frame.f_globals.get("__name__") != ConfigurationError.__module__
         ]
     if not own:
         return None
     frame, line = own[-1]
-    function = frame.f_code.co_qualname
-    return _Place(
-        frame.f_code.co_filename, line, frame.f_code.co_name if "<locals>" in function else function
-    )
+    code = frame.f_code
+    function = code.co_name if "<locals>" in code.co_qualname else code.co_qualname
+    return Place(code.co_filename, line, function)
 
 
-def _beginning(method: Callable[..., Any]) -> _Place | None:
+def beginning(method: Callable[..., Any]) -> Place | None:
     """Return where a method is defined; None for one without source."""
     function = inspect.unwrap(getattr(method, "__func__", method))
     code = getattr(function, "__code__", None)
     if code:
-        return _Place(code.co_filename, code.co_firstlineno, code.co_qualname)
+        return Place(code.co_filename, code.co_firstlineno, code.co_qualname)
     return None
 
 
 def _trace(error: BaseException) -> str:
     """Return a trace from the first line that is not the harness's, and those of the errors behind it."""
     whole = shown = traceback.TracebackException.from_exception(error, compact=True)
-    if isinstance(error, WrongAnswer) and (place := _beginning(error.method)):
+    if isinstance(error, WrongAnswer) and (place := beginning(error.method)):
         whole.stack = traceback.StackSummary.from_list([traceback.FrameSummary(*place)])
         return "".join(whole.format())
     seen = set()

@@ -18,8 +18,8 @@ from servobench.harness.run.references import (
     LedImage,
     LedPlaces,
     Reference,
+    Segment,
     TaskKind,
-    TaughtImage,
 )
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_array, check_number, real_numbers
@@ -73,6 +73,13 @@ class Scenario:
         return tuple(math.ceil(each / period - 1e-9) for each in self.jumps)
 
 
+class Cameras(NamedTuple):
+    """A robot with cameras that see pixels."""
+
+    planned: SetupModel  # the nominal robot with its cameras as planned
+    true: SetupModel
+
+
 @dataclass(frozen=True)
 class TaskSetting:
     """Where a task is to be done."""
@@ -106,7 +113,7 @@ class TaskSetting:
         """
         model = self.taught_on()[1]
         if isinstance(model, SetupModel):
-            return TaughtImage(model, joint_position)
+            return LedImage(model, JointPath((Segment(math.inf, joint_position),)))
         return FixedPoint(model.feature(joint_position))
 
     def taught_on(self) -> tuple[Robot, RobotModel]:
@@ -120,6 +127,12 @@ class TaskSetting:
                 "it is taught on a known robot, and this plant brings a robot of its own"
             )
         return self.robot, self.model
+
+    def cameras(self) -> Cameras | None:
+        """Return the cameras as planned and the true ones; None where features are places."""
+        if isinstance(self.model, SetupModel) and isinstance(self.nominal, SetupModel):
+            return Cameras(self.nominal, self.model)
+        return None
 
     def led(self, path: JointPath) -> Reference:
         """Return the desired features while the arm is led along a path, as a user would teach them one by one.

@@ -29,15 +29,15 @@ from dataclasses import replace
 from typing import Annotated, Final, Literal, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Gt, Le
 
-from servobench.harness.run.scenario import Scenario, Task, TaskSetting, Vector, numbers
+from servobench.harness.run.scenario import Cameras, Scenario, Task, TaskSetting, Vector, numbers
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Number, Positive, settings
+from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.hand_eye import HandEyeModel, rotation_matrix
 from servobench.plant.robot.inverse import reach_pose
@@ -115,10 +115,11 @@ def drawn_moves(
     Raises:
         ValueError: too few postures are fit.
     """
-    robot, true = setting.taught_on()
-    if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
+    robot, _ = setting.taught_on()
+    cameras = setting.cameras()
+    if cameras is not None:
         while True:
-            yield draw_in_view(box, robot, setting.nominal, true, generator)
+            yield draw_in_view(box, setting, cameras.planned, generator)
     n = robot.n
     for _ in range(MAX_PAIRS // PAIRS_AT_ONCE):
         pairs = generator.uniform(box.lower, box.upper, (PAIRS_AT_ONCE, 2, n))
@@ -136,25 +137,25 @@ def drawn_moves(
     )
 
 
-def are_fit(postures: FloatArray, box: Box, setting: TaskSetting) -> npt.NDArray[np.bool_]:
+def are_fit(postures: FloatArray, box: Box, setting: TaskSetting) -> BoolArray:
     """Return which of the postures (k, n) rad are fit, (k,), wherever the camera is moved."""
-    robot, true = setting.taught_on()
-    if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
-        return _fit(postures, box, robot, setting.nominal, true)
-    return _is_free(postures, box, robot)
+    robot, _ = setting.taught_on()
+    fit = _is_free(postures, box, robot)
+    cameras = setting.cameras()
+    if cameras is not None:
+        fit[fit] = _in_view(postures[fit], cameras)
+    return fit
 
 
-def are_apart(
-    postures: FloatArray, place: FloatArray, box: Box, setting: TaskSetting
-) -> npt.NDArray[np.bool_]:
+def are_apart(postures: FloatArray, place: FloatArray, box: Box, setting: TaskSetting) -> BoolArray:
     """Return which of the postures (k, n) rad are as far from a place (n,) rad as a target from its start, (k,)."""
     robot = setting.taught_on()[0]
     if isinstance(setting.nominal, SetupModel):
         features = setting.nominal.feature(postures)
         least = box.shortest * setting.nominal.noise_unit
-        return np.asarray(norm(features - setting.nominal.feature(place)) >= least)
+        return norm(features - setting.nominal.feature(place)) >= least
     balls = robot.arm.ball_position(postures)
-    return np.asarray(norm(balls - robot.arm.ball_position(place)) >= box.shortest)
+    return norm(balls - robot.arm.ball_position(place)) >= box.shortest
 
 
 def stays_in_reach(target: FloatArray, box: Box, setting: TaskSetting) -> bool:
@@ -169,30 +170,29 @@ def stays_in_reach(target: FloatArray, box: Box, setting: TaskSetting) -> bool:
 
 
 def draw_in_view(
-    box: Box, robot: Robot, nominal: SetupModel, true: SetupModel, generator: np.random.Generator
+    box: Box, setting: TaskSetting, planned: SetupModel, generator: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint positions of start and target, (n,) and (n,) rad.
 
     Args:
         box: where to draw.
-        robot: the nominal one.
-        nominal: the same with its cameras as planned.
-        true: the true arm and cameras.
+        setting: with the true arm and cameras.
+        planned: the nominal robot with its cameras as planned.
         generator: of the draws.
 
     Raises:
         ValueError: too few postures are fit.
     """
     # The same distance in the image, however near the camera is.
-    least = box.shortest * nominal.noise_unit
-    found = np.empty((MAX_DRAWS, robot.n))
-    features = np.empty((MAX_DRAWS, len(nominal.channel.names)))
+    least = box.shortest * planned.noise_unit
+    found = np.empty((MAX_DRAWS, setting.n))
+    features = np.empty((MAX_DRAWS, len(planned.channel.names)))
     count = 0
     for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
-        drawn = generator.uniform(box.lower, box.upper, (DRAWN_AT_ONCE, robot.n))
-        for posture in drawn[_fit(drawn, box, robot, nominal, true)]:
+        drawn = generator.uniform(box.lower, box.upper, (DRAWN_AT_ONCE, setting.n))
+        for posture in drawn[are_fit(drawn, box, setting)]:
             found[count] = posture
-            features[count] = nominal.feature(posture)
+            features[count] = planned.feature(posture)
             far = norm(features[count] - features[:count]) >= least
             if far.any():
                 return found[far.argmax()], posture
@@ -202,7 +202,7 @@ def draw_in_view(
 
 
 def drawn_together(
-    start: FloatArray, target: FloatArray, robot: Robot, nominal: SetupModel, true: SetupModel
+    start: FloatArray, target: FloatArray, robot: Robot, cameras: Cameras
 ) -> tuple[FloatArray, FloatArray]:
     """Return start and target of a move, (n,) and (n,) rad, drawn together in tenths until both are in view.
 
@@ -214,7 +214,7 @@ def drawn_together(
     home = robot.workspace.home
     for tenths in range(10, 0, -1):
         both = home + 0.1 * tenths * (np.stack([start, target]) - home)
-        if _in_view(both, nominal, true).all():
+        if _in_view(both, cameras).all():
             if tenths == 10:
                 return (start, target)
             return (both[0], both[1])
@@ -226,32 +226,24 @@ def drawn_together(
     )
 
 
-def _fit(
-    drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: SetupModel
-) -> npt.NDArray[np.bool_]:
-    """Return which of the postures (k, n) rad are fit, (k,)."""
-    fit = _is_free(drawn, box, robot)
-    fit[fit] = _in_view(drawn[fit], nominal, true)
-    return fit
-
-
-def _is_free(postures: FloatArray, box: Box, robot: Robot) -> npt.NDArray[np.bool_]:
+def _is_free(postures: FloatArray, box: Box, robot: Robot) -> BoolArray:
     """Return in which postures (..., n) rad nothing touches the table or the arm, (...)."""
     free = robot.arm.ball_position(postures)[..., 2] >= box.lowest
     if robot.workspace.clear is not None:
         free &= robot.workspace.clear(postures)
-    return np.asarray(free)
+    return free
 
 
-def _in_view(postures: FloatArray, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:
+def _in_view(postures: FloatArray, cameras: Cameras) -> BoolArray:
     """Return in which postures (k, n) rad the cameras see all features as they should, (k,)."""
-    points = nominal.points(postures)
-    planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1)
-    facing = nominal.incidence(points) >= FACING
+    planned, true = cameras
+    points = planned.points(postures)
+    foreseen = planned.valid_at(points, PLANNED_SHARE).all(axis=-1)
+    facing = planned.incidence(points) >= FACING
     # Marks may be larger in a user's image.
-    share = TRUE_SHARE if nominal.planned == CAMERA else PLANNED_SHARE
+    share = TRUE_SHARE if planned.planned == CAMERA else PLANNED_SHARE
     seen = true.valid_at(true.points(postures), share).all(axis=-1)
-    return np.asarray(planned & facing & seen)
+    return foreseen & facing & seen
 
 
 @settings
@@ -271,14 +263,11 @@ class PoseTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        robot, true = setting.taught_on()
-        if not (
-            isinstance(true, SetupModel)
-            and isinstance(setting.nominal, SetupModel)
-            and true.setup.judges_pose
-        ):
+        robot, _ = setting.taught_on()
+        cameras = setting.cameras()
+        if cameras is None or not cameras.true.setup.judges_pose:
             raise ValueError("it needs a target with a pose; use the sensing plate or plate:hand")
-        start = pose_start(self, robot, setting.nominal)
+        start = pose_start(self, robot, cameras.planned)
         return setting.move(start, setting.taught(robot.workspace.home), self.duration)
 
 

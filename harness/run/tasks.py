@@ -18,7 +18,6 @@ from servobench.harness.run.references import FixedPoint, Laps, line, read_waypo
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
 from servobench.harness.run.sequences import AgainTask, TourTask
 from servobench.harness.run.starts import PLACES, BoxTask, PoseTask, drawn_moves, drawn_together
-from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import as_array, check_number
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
@@ -65,13 +64,10 @@ class PointTask(Task):
             as_array(f"its setting {name}", getattr(self, name), (setting.n,))
             for name in ("start", "target")
         )
-        robot, true = setting.taught_on()
-        if (
-            self.into_view
-            and isinstance(true, SetupModel)
-            and isinstance(setting.nominal, SetupModel)
-        ):
-            start, target = drawn_together(start, target, robot, setting.nominal, true)
+        robot, _ = setting.taught_on()
+        cameras = setting.cameras()
+        if self.into_view and cameras is not None:
+            start, target = drawn_together(start, target, robot, cameras)
         return setting.move(start, setting.taught(target), self.duration)
 
     def scaled(self, name: str, work: Workspace) -> Self:

@@ -27,11 +27,12 @@ ROLES: Final = ("plant", "controller", "task")
 SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))
 ORDER: Final = {short.key: order for order, short in enumerate(SHORT_NAMES.values())}
 
+Row: TypeAlias = Mapping[str, Any]  # of the table of runs, by its columns
 Value: TypeAlias = float | int | bool | str | tuple["Value", ...]
 Varied: TypeAlias = tuple[tuple[str, Value], ...]
 
 
-def varied_in_row(row: Mapping[str, Any]) -> Varied:
+def varied_in_row(row: Row) -> Varied:
     """Return the settings that a run varies, by key, from its row in a table of runs."""
     columns = [(short.column, short.key, short.usual) for short in SHORT_NAMES.values()]
     columns += [(key, key, None) for key in row if "." in key]

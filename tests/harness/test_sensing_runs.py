@@ -97,7 +97,7 @@ def test_starts_and_targets_are_in_view_and_taught_on_the_true_robot(word, seed)
     model, reference = run.true, run.scenario.reference
     assert model.valid(run.scenario.start).all()
     assert model.valid_at(reference.points(0.0)).all()
-    np.testing.assert_array_equal(reference.at(3.0), model.feature(reference.joint_position))
+    np.testing.assert_array_equal(reference.at(3.0), model.feature(reference.path.at(0.0)))
     if ":hand" in word and "plate" not in word:  # where a fixed circle might leave the view
         curve = drawn(word, "circle", seed)
         assert curve.true.valid_at(
@@ -210,7 +210,7 @@ def test_moves_are_drawn_together_until_both_ends_are_in_view(word, task):
     config, home = resolve(request(word, task), Settings({})).task, robot.workspace.home
     pairs = (
         (run.scenario.start, config.start),
-        (run.scenario.reference.joint_position, config.target),
+        (run.scenario.reference.path.at(0.0), config.target),
     )
     ways = [(q - home, given - home) for q, given in pairs if np.any(np.asarray(given) != home)]
     share = [way @ whole / (whole @ whole) for way, whole in ways]

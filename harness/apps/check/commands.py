@@ -56,10 +56,8 @@ def new(
             f"the name must be one of a Python module, such as my_law, got {name!r}"
         )
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
-    templates = "aided_controller" if aids else kind, f"{PREFIX}{kind}"
-    wanted = dict(
-        zip((folder / f"{module}.py", folder / f"{PREFIX}{module}.py"), templates, strict=True)
-    )
+    own = "aided_controller" if aids else kind
+    wanted = {folder / f"{module}.py": own, folder / f"{PREFIX}{module}.py": f"{PREFIX}{kind}"}
     for path in wanted:
         if path.exists():
             raise ConfigurationError(

@@ -94,25 +94,27 @@ class ControllerChecks:
     def checks(self) -> list[Check]:
         """Return the checks in their order."""
         alike = ("command", "repeatable")
+        first = (self.limits, self.diagnostics, self.repeatable)
+        last = (
+            self.at_target,
+            self.lost_feature,
+            self.large_numbers,
+            self.other_sizes,
+            self.no_preview,
+            self.approach,
+            self.time,
+            self.output,
+            self.aids,
+            self.side_by_side,
+        )
         return [
-            Check("constructor", self.constructor),
-            Check("command", self.command, ("constructor",)),
-            Check("limits", self.limits, ("command",)),
-            Check("diagnostics", self.diagnostics, ("command",)),
-            Check("repeatable", self.repeatable, ("command",)),
-            Check("reset", self.reset, alike),
-            Check("separate", self.separate, alike),
-            Check("save", self.save, (*alike, "separate")),
-            Check("at target", self.at_target, ("command",)),
-            Check("lost feature", self.lost_feature, ("command",)),
-            Check("large numbers", self.large_numbers, ("command",)),
-            Check("other sizes", self.other_sizes, ("command",)),
-            Check("no preview", self.no_preview, ("command",)),
-            Check("approach", self.approach, ("command",)),
-            Check("time", self.time, ("command",)),
-            Check("output", self.output, ("command",)),
-            Check("aids", self.aids, ("command",)),
-            Check("side by side", self.side_by_side, ("command",)),
+            Check.of(self.constructor),
+            Check.of(self.command, "constructor"),
+            *(Check.of(each, "command") for each in first),
+            Check.of(self.reset, *alike),
+            Check.of(self.separate, *alike),
+            Check.of(self.save, *alike, "separate"),
+            *(Check.of(each, "command") for each in last),
         ]
 
     def constructor(self) -> None:

@@ -92,15 +92,18 @@ class PlantChecks:
     def checks(self) -> list[Check]:
         """Return the checks in their order."""
         run = ("build", "run")
+        middle = (
+            self.repeatable,
+            self.clipping,
+            self.wrong_size,
+            self.negative_seed,
+            self.truth,
+        )
         return [
-            Check("build", self.build),
-            Check("run", self.run, ("build",)),
-            Check("repeatable", self.repeatable, run),
-            Check("clipping", self.clipping, run),
-            Check("wrong size", self.wrong_size, run),
-            Check("negative seed", self.negative_seed, run),
-            Check("truth", self.truth, run),
-            Check("save", self.save, (*run, "repeatable")),
+            Check.of(self.build),
+            Check.of(self.run, "build"),
+            *(Check.of(each, *run) for each in middle),
+            Check.of(self.save, *run, "repeatable"),
             Check("close", self.closing, run),
         ]
 

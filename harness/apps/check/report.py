@@ -1,16 +1,15 @@
 """Findings of checks: each ok, failed or a note."""
 
 import contextlib
-import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 
 from servobench.harness.config.source import describe_at, show
-from servobench.harness.run.result import WrongAnswer
+from servobench.harness.run.result import WrongAnswer, beginning
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
@@ -86,6 +85,11 @@ class Check(NamedTuple):
     needs: tuple[str, ...] = ()
     """checks without which this one finds nothing new"""
 
+    @classmethod
+    def of(cls, method: Callable[[], str | None], *needs: str) -> Self:
+        """Return the check of a method, by the name of it in words."""
+        return cls(method.__name__.replace("_", " "), method, needs)
+
 
 def report(
     subject: str,
@@ -132,10 +136,10 @@ def _defect(error: BaseException) -> str:
 
 def at(method: Any) -> str:  # noqa: ANN401 - a method or a function
     """Return `FILE:LINE` of a method."""
-    code = getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)
-    if code:
-        return f"{show(Path(code.co_filename))}:{code.co_firstlineno}"
-    return "step"
+    place = beginning(method)
+    if place is None:
+        return "step"
+    return f"{show(Path(place.file))}:{place.line}"
 
 
 def _remedy(error: BaseException) -> str:

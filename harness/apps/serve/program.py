@@ -13,7 +13,7 @@ from typing import Any, Final, final
 
 import numpy as np
 
-from servobench.harness.apps.serve.wire import CONTROLLER
+from servobench.harness.apps.serve.wire import CONTROLLER, Say
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
@@ -87,9 +87,7 @@ class ControlProgram:
         busy: whether a motion is under way that ends by itself.
     """
 
-    def __init__(
-        self, spec: PlantSpec, drive: TrueModel, say: Callable[[str], None], *, lockstep: bool
-    ) -> None:
+    def __init__(self, spec: PlantSpec, drive: TrueModel, say: Say, *, lockstep: bool) -> None:
         """Take spec and drive of the plant, and a printer of lines; in lockstep accelerations have no limit."""
         self._spec = spec
         self._drive = drive

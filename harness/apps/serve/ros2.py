@@ -13,7 +13,6 @@ an arm safe: it stands in for a robot that has its own limits.
 
 import math
 import time
-from collections.abc import Callable
 from typing import Any, Final, TypeAlias, final
 
 import numpy as np
@@ -27,6 +26,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 
 from servobench.harness.apps.serve.served import WATCHDOG, Served, Velocities
+from servobench.harness.apps.serve.wire import Say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Observation
 
@@ -44,7 +44,7 @@ News: TypeAlias = list[tuple[Any, Any]]  # publishers, each with its message
 class Robot:
     """The node around a served plant."""
 
-    def __init__(self, served: Served, say: Callable[[str], None], *, lockstep: bool) -> None:
+    def __init__(self, served: Served, say: Say, *, lockstep: bool) -> None:
         """Take a plant whose feature is a point, and a printer of lines.
 
         Raises:

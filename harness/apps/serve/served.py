@@ -1,11 +1,12 @@
 """A plant that commands from elsewhere move, for every protocol: steps, clock, and the velocities that it follows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, final
 
 import numpy as np
 
+from servobench.harness.apps.serve.wire import Say
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.feasibility import check_possible
@@ -36,7 +37,7 @@ class Served:
         self,
         request: RunRequest,
         settings: Settings,
-        say: Callable[[str], None],
+        say: Say,
         *,
         lockstep: bool,
         stamps: bool = False,
@@ -103,7 +104,7 @@ class Velocities:
         came: whether some came since this was last set to False.
     """
 
-    def __init__(self, joints: int, patience: float, say: Callable[[str], None]) -> None:
+    def __init__(self, joints: int, patience: float, say: Say) -> None:
         """Take the number of joints, the longest silence [s], and a printer of lines."""
         self.came = False
         self._rest = np.zeros(joints)

@@ -76,7 +76,7 @@ class Server:
         self,
         request: RunRequest,
         settings: Settings,
-        say: Callable[[str], None],
+        say: wire.Say,
         *,
         lockstep: bool = False,
     ) -> None:
@@ -236,13 +236,10 @@ class Server:
         pose = (*flange[:3, 3], *turn.ravel())
         velocity = (joints - before) / self._spec.period
         moving = velocity if now.time > 0.0 else wire.ZEROS["VECTOR6D"]
-        self.state["timestamp"] = now.time
-        self.state["actual_q"] = joints
-        self.state["target_q"] = joints
-        self.state["actual_qd"] = moving
-        self.state["target_qd"] = self.program.velocity
-        self.state["actual_TCP_pose"] = pose
-        self.state["target_TCP_pose"] = pose
+        self.state |= {
+            "timestamp": now.time, "actual_q": joints, "target_q": joints, "actual_qd": moving,
+            "target_qd": self.program.velocity, "actual_TCP_pose": pose, "target_TCP_pose": pose,
+        }  # fmt: skip
 
     def _publish(self) -> None:
         """Send the state to every client whose turn it is."""
@@ -384,12 +381,10 @@ class Server:
     def _switch(self, values: dict[str, Any]) -> None:
         """Set outputs of the control box and the tool."""
         for name, shift in (("standard", 0), ("configurable", 8), ("tool", 16)):
-            mask, bits = (
-                values.get(f"{name}_digital_output{end}", 0) << shift for end in ("_mask", "")
-            )
-            self.state["actual_digital_output_bits"] = (
-                self.state["actual_digital_output_bits"] & ~mask | bits & mask
-            )
+            mask = values.get(f"{name}_digital_output_mask", 0) << shift
+            bits = values.get(f"{name}_digital_output", 0) << shift
+            before = self.state["actual_digital_output_bits"]
+            self.state["actual_digital_output_bits"] = before & ~mask | bits & mask
         for k in (0, 1):
             if values.get("standard_analog_output_mask", 0) >> k & 1:
                 share = values.get(f"standard_analog_output_{k}", 0.0)

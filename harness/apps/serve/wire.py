@@ -12,12 +12,12 @@ import asyncio
 import re
 import struct
 import tomllib
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from itertools import islice
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeAlias
 
 CONTROLLER: Final = tomllib.loads(
     files(__package__).joinpath("controller.toml").read_text(encoding="utf-8")
@@ -31,6 +31,7 @@ MAX_LINE: Final = 4096  # bytes
 # HTTP, or bytes that are no text
 FOREIGN: Final = re.compile(rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]")
 NOT_FOUND: Final = "NOT_FOUND"
+Say: TypeAlias = Callable[[str], None]  # prints a line for the user
 CODES: Final = CONTROLLER["codes"]  # type -> layout of struct
 ZEROS: Final = {kind: (0,) * int(code[:-1] or 1) for kind, code in CODES.items()}
 REGISTERS: Final = {"int": "INT32", "double": "DOUBLE"}
