@@ -82,6 +82,7 @@ class Instance(ABC):
     """One instance of an FMU."""
 
     dialect: ClassVar[FmiDialect]  # the version of FMI
+    boolean: ClassVar[type[ctypes.c_int | ctypes.c_bool]]  # its truth values, for C
 
     def __init__(
         self, description: FmuDescription, tolerance: float | None, debug_log: Path | None
@@ -110,14 +111,20 @@ class Instance(ABC):
 
     def start(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
-        self._initialise(time)
+        has_tolerance = self.boolean(self.tolerance is not None)
+        tolerance = ctypes.c_double(self.tolerance or 0.0)
+        start = ctypes.c_double(time)
+        has_stop = self.boolean(False)
+        stop = ctypes.c_double()
+        self._enter_initialisation(has_tolerance, tolerance, start, has_stop, stop)
+        self.call("ExitInitializationMode")
         if self.description.exchange:
             self._integrator = Integrator(self)
         self._begun = True
 
     @abstractmethod
-    def _initialise(self, time: float) -> None:
-        """Go through initialisation, to begin at `time`."""
+    def _enter_initialisation(self, *experiment: Any) -> None:  # noqa: ANN401 - types of C
+        """Begin initialisation for an experiment: tolerance, start and stop time as the standard has them."""
 
     @abstractmethod
     def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
