@@ -31,40 +31,15 @@ from servobench.plant.contract.settings import (
     settings,
 )
 from servobench.plant.robot.camera import PinholeCamera
-from servobench.plant.robot.camera_formats import LENSES, in_rows, plain_name, read_intrinsics
+from servobench.plant.robot.camera_formats import (
+    FACTS,
+    LENSES,
+    in_rows,
+    plain_name,
+    read_intrinsics,
+)
 
-# ROS's name of a model -> its names without capitals, blanks, hyphens and underscores
-LENS_NAMES: Final[Mapping[str, tuple[str, ...]]] = {
-    "plumb_bob": ("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"),
-    "rational_polynomial": ("rationalpolynomial", "rational", "rationalmodel", "fullopencv"),
-    "equidistant": (
-        "equidistant",
-        "equi",
-        "fisheye",
-        "opencvfisheye",
-        "kb",
-        "kb4",
-        "kb8",
-        "kannalabrandt",
-        "kannalabrandt4",
-        "kannalabrandt8",
-    ),
-    "": ("", "opencv"),
-    "none": (
-        "none",
-        "null",
-        "no",
-        "nodistortion",
-        "undistorted",
-        "rectified",
-        "ideal",
-        "pinhole",
-        "perspective",
-        "inversebrownconrady",
-        "modifiedbrownconrady",
-    ),
-}
-SYNONYMS: Final = {name: lens for lens, names in LENS_NAMES.items() for name in names}
+SYNONYMS: Final = {name: lens for lens, names in FACTS["lens_names"].items() for name in names}
 WANTED: Final = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
 RANGES: Final = {  # unit, least and largest number
     "width": ("px", 16, 20_000), "height": ("px", 16, 20_000), "vertical_fov": ("deg", 2, 170),
@@ -121,11 +96,9 @@ class Pose(Place):
         """Check the numbers."""
         super().__post_init__()
         if self.matrix[2, 2] < MIN_AHEAD and self.frame == "flange":
-            wanted = (
-                "z is the optical axis, x points right and y down, and a quaternion is x, y, z, w"
-            )
             remark(
-                f"pose.rotation turns the optical axis by more than 60° from the flange's z axis: {wanted}"
+                "pose.rotation turns the optical axis by more than 60° from the flange's z axis: z is the "
+                "optical axis, x points right and y down, and a quaternion is x, y, z, w"
             )
 
     @cached_property
@@ -141,8 +114,9 @@ class Pose(Place):
         elif _is_rotation_matrix(given):
             rotation = Rotation.from_matrix(given)
         else:
-            wanted = "a rotation matrix or a quaternion of length 1"
-            raise ValueError(f"pose.rotation must be {wanted}, got {self.rotation}")
+            raise ValueError(
+                f"pose.rotation must be a rotation matrix or a quaternion of length 1, got {self.rotation}"
+            )
         pose = np.eye(4)
         pose[:3, :3] = rotation.as_matrix()
         pose[:3, 3] = self.position or 0.0
@@ -344,9 +318,9 @@ def _matrix(keys: CameraFile) -> FloatArray:
     min_focal, max_focal = FOCAL
     for focal in (float(K[0, 0]), float(K[1, 1])):
         if not min_focal * width <= focal <= max_focal * width:
-            wanted = "in px it is the focal length in mm over the side of a pixel in mm"
             raise ValueError(
-                f"matrix: a focal length of {focal:g} px does not fit a width of {width} px; {wanted}"
+                f"matrix: a focal length of {focal:g} px does not fit a width of {width} px; in px it is the "
+                "focal length in mm over the side of a pixel in mm"
             )
     size = (width, height)
     principal_point = K[:2, 2]
