@@ -544,8 +544,9 @@ def build_bench(
         if step == setup.period:
             raise
         found = f"in sub-steps of {step:g} s, which the delays and the period need: {error}"
-        remedy = "run.period, command_delay and latency that are multiples of its own step help"
-        raise ValueError(f"{found}; {remedy}") from error
+        raise ValueError(
+            f"{found}; run.period, command_delay and latency that are multiples of its own step help"
+        ) from error
     command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
     camera = None if setup.model is None else setup.model.camera
     return Bench(world, command_delay, sensing, setup.period, camera)

@@ -311,8 +311,10 @@ class FmuWorld(World):
                 )
         if jumps:
             found = f"{self.description.path.name} returns 0 at the start for what then jumps though the arm rests"
-            remedy = "let it compute its outputs in the initialisation, too, or map `seen`"
-            remark(f"{found}: {', '.join(jumps)}; runs begin with a wrong measurement: {remedy}")
+            remark(
+                f"{found}: {', '.join(jumps)}; runs begin with a wrong measurement: let it compute its outputs in "
+                "the initialisation, too, or map `seen`"
+            )
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """Set the parameters of the camera's pose; see `Plant.move_camera`.
@@ -579,9 +581,9 @@ def _exported_arm(path: Path) -> FmuMapping:
     units = {variable.name.partition("[")[0]: variable.unit for variable in description.variables}
     features = [name for name in ARM_FEATURES if name in units]
     if not (features and {*ARM_JOINTS, "jacobian"} <= units.keys()):
-        keys = "its file, inputs and features"
         raise ValueError(
-            f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names {keys}"
+            f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names its file, "
+            "inputs and features"
         )
     return FmuMapping(
         path,

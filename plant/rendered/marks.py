@@ -27,7 +27,7 @@ from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, 
 from servobench.plant.robot.camera import IntArray, PinholeCamera
 
 Colour = tuple[float, float, float, float]  # red, green, blue and opacity, each up to 1
-RED: Final[Colour] = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
+RED: Final = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
 
 
 class MarkColour(NamedTuple):

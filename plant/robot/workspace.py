@@ -322,8 +322,10 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
         size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
         raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
     look = _likely_cause(arm, limits, shapes)
-    wanted = "in which its ball is over the table, in view of the camera and free of contact"
-    raise ValueError(f"the arm has no posture {wanted}; look at {look}")
+    raise ValueError(
+        "the arm has no posture in which its ball is over the table, in view of the camera and free of contact; "
+        f"look at {look}"
+    )
 
 
 def _likely_cause(arm: SerialArm, limits: Pair, shapes: Pair) -> str:
