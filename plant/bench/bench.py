@@ -184,8 +184,7 @@ class Shown(NamedTuple):
         return type(self)(feature, np.logical_or(self.valid, arrived), captured)
 
 
-@dataclass(frozen=True, eq=False)
-class BenchState:
+class BenchState(NamedTuple):
     """A saved state of a bench; it can be pickled if that of its world can."""
 
     period: int  # number of control periods since the reset

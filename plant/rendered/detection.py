@@ -11,7 +11,6 @@ where that slope grows without bound, and pixels whose residual stands far off t
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import cv2
@@ -50,16 +49,24 @@ OUTLINE = (40, 255, 80)  # RGB of the drawn detection
 MARGIN = 6
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
+class Patch(NamedTuple):
     """The largest red patch in an image."""
 
     rows: IntArray  # (k,), px
     columns: IntArray  # (k,), px
 
+    def mask(self, margin: int = 0) -> tuple[ByteArray, int, int]:
+        """Return a mask of the box around the pixels with a margin [px], and the box's first row and column."""
+        top = int(self.rows.min()) - margin
+        left = int(self.columns.min()) - margin
+        bottom = int(self.rows.max()) + 1 + margin
+        right = int(self.columns.max()) + 1 + margin
+        mask = np.zeros((bottom - top, right - left), dtype=np.uint8)
+        mask[self.rows - top, self.columns - left] = 1
+        return mask, top, left
 
-@dataclass(frozen=True, eq=False)
-class Detection:
+
+class Detection(NamedTuple):
     """A ball as a sphere of known radius fitted to depths."""
 
     centre: FloatArray  # (3,), m, camera frame

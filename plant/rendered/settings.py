@@ -87,15 +87,8 @@ class DriveConfig:
         Raises:
             ValueError: a list of another length.
         """
-        lists = {
-            "velocity_bandwidth": self.velocity_bandwidth,
-            "torque_limit": self.torque_limit,
-            "rotor_inertia": self.rotor_inertia,
-            "coulomb_friction": self.coulomb_friction,
-            "viscous_friction": self.viscous_friction,
-        }
-        for name, values in lists.items():
-            if len(values) not in {1, n}:
+        for name, values in vars(self).items():
+            if isinstance(values, tuple) and len(values) not in {1, n}:
                 raise ValueError(f"{name} must have 1 or {n} numbers, got {len(values)}")
 
 

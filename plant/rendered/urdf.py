@@ -190,14 +190,13 @@ def _subdivided(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
     """Return vertices (4 f, 3)/2 + 2 and triangles (4 f, 3) of a sphere whose f triangles are split in four."""
     followers = np.roll(triangles, -1, axis=1)
     edges = np.stack([triangles, followers], axis=-1).reshape(-1, 2)
-    edges = np.sort(edges, axis=1)
     # Two triangles share each edge, and its middle: one new vertex for each pair of ends.
-    keys = edges[:, 1] * len(vertices) + edges[:, 0]
-    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    descending = -np.sort(-edges, axis=1)
+    pairs, place = np.unique(descending, axis=0, return_inverse=True)
     a, b, c = triangles.T
     ab, bc, ca = len(vertices) + place.reshape(-1, 3).T
     split = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1)
-    middles = vertices[edges[first]].mean(axis=1)
+    middles = vertices[pairs].mean(axis=1)
     refined = np.concatenate([vertices, middles])
     length = np.sqrt(np.dot(refined**2, np.ones(3)))[:, None]
     on_sphere = refined + refined / length * (1.0 - length)
