@@ -193,14 +193,9 @@ class SensingSetup:
                 "points.copy()"
             )
         differences = self._differences(points, motions, optics, COARSE_STEP)
-        if self.rates is not None:
-            self._check_rates(rates, differences)
-
-    def _check_rates(self, rates: FloatArray, differences: FloatArray) -> None:
-        """Refuse `rates` that differ from the differences of `measure`, both (k, m, 2)."""
         wrong = np.abs(rates - differences).max(axis=(0, 2))
         bound = RATE_TOLERANCE * np.abs(differences).max()
-        if not (wrong <= bound).all():
+        if self.rates is not None and not (wrong <= bound).all():
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"

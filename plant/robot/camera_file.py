@@ -106,12 +106,13 @@ class Pose(Place):
         """The pose in its frame, (4, 4)."""
         from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
-        given = np.zeros(0)
+        given: FloatArray = np.zeros(0)
         if len({np.size(row) for row in self.rotation}) == 1:
             given = np.array(self.rotation)
-        if _is_quaternion(given):
+        # Numbers may be rounded.
+        if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
             rotation = Rotation.from_quat(given)
-        elif _is_rotation_matrix(given):
+        elif given.shape == (3, 3) and _is_rotation_matrix(given):
             rotation = Rotation.from_matrix(given)
         else:
             raise ValueError(
@@ -123,15 +124,8 @@ class Pose(Place):
         return pose
 
 
-def _is_quaternion(given: FloatArray) -> bool:
-    """Return whether an array is a quaternion of length 1, whose numbers may be rounded."""
-    return given.shape == (4,) and bool(abs(np.linalg.norm(given) - 1.0) < ROUNDED)
-
-
 def _is_rotation_matrix(given: FloatArray) -> bool:
-    """Return whether an array is a rotation matrix, whose numbers may be rounded."""
-    if given.shape != (3, 3):
-        return False
+    """Return whether a matrix (3, 3) is a rotation, whose numbers may be rounded."""
     deviation = np.abs(given @ given.T - np.eye(3)).max()
     return bool(deviation < ROUNDED < np.linalg.det(given))
 
@@ -285,7 +279,9 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
         matrix = _matrix(keys)
         lens, distortion = _lens(keys)
         camera = OwnCamera(tuple(files), keys, matrix, lens, distortion, other)
-        _check(camera)
+        _check_distortion(camera)
+        if other is not None:
+            _check_second(camera, other)
     return camera
 
 
@@ -439,13 +435,6 @@ def _least_root(polynomial: npt.ArrayLike) -> float:
     is_real = np.abs(roots.imag) < 1e-9 * np.abs(roots)
     positive = roots.real[is_real & (roots.real > 0.0)]
     return float(min(positive, default=ENDLESS))
-
-
-def _check(camera: OwnCamera) -> None:
-    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together."""
-    _check_distortion(camera)
-    if camera.second is not None:
-        _check_second(camera, camera.second)
 
 
 def _check_distortion(camera: OwnCamera) -> None:

@@ -266,16 +266,10 @@ def _element_matters(parent: str, part: Element) -> bool:
         return parent in GEOMETRY + ENDS
     if _is_like(tag, SIMILAR[parent]):
         return True
-    return parent == "joint" and _holds_vector(part)
-
-
-def _holds_vector(part: Element) -> bool:
-    """Return whether an attribute or a text of an element, or of one in it, is a vector."""
+    texts = list[str]()
     for element in part.iter():
-        texts = (*element.attrib.values(), element.text or "")
-        if any(map(_is_vector, texts)):
-            return True
-    return False
+        texts += (*element.attrib.values(), element.text or "")
+    return parent == "joint" and any(map(_is_vector, texts))
 
 
 def _is_like(word: str, words: Iterable[str]) -> bool:
@@ -300,18 +294,13 @@ def _check_numbers(what: str, text: str, count: int, *, infinite: bool) -> None:
         return
     words = text.split()
     for word in words:
-        if not _is_number(word, infinite=infinite):
+        # A limit may be infinite by its size or by its name.
+        is_number = NUMBER.fullmatch(word) or INFINITE.fullmatch(word)
+        if not is_number or not (infinite or isfinite(float(word))):
             remedy = next((f"; {remedy}" for fault, remedy in REMEDIES if fault.search(word)), "")
             raise ValueError(f"{what} has {word!r}, which is no number{remedy}")
     if len(words) != count:
         raise ValueError(f"{what}: the count of numbers must be {count}, got {text!r}")
-
-
-def _is_number(word: str, *, infinite: bool) -> bool:
-    """Return whether a word is a number; one that may be infinite can be so by its size or by its name."""
-    if infinite:
-        return bool(NUMBER.fullmatch(word) or INFINITE.fullmatch(word))
-    return bool(NUMBER.fullmatch(word)) and isfinite(float(word))
 
 
 def _turn_by_quaternion(origin: ET.Element, place: str) -> None:
