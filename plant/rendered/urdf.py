@@ -236,7 +236,7 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    tree = arm_tree(arm, robot)
+    tree = arm_tree(arm, robot, payload)
     for link in tree.iter("link"):
         for visual in link.findall("visual"):
             if not shapes:
@@ -248,9 +248,6 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
             for mesh in visual.findall("geometry/mesh"):
                 mesh.tag = "sphere"
                 mesh.attrib = {"radius": repr(robot.workspace.ball_radius)}
-        mass = link.find("inertial/mass")
-        if link.get("name") == BALL_LINK and mass is not None:
-            mass.set("value", repr(LIGHT_PART[0] + payload))
     return text(tree)
 
 
@@ -278,7 +275,7 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     return text(robot)
 
 
-def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
+def arm_tree(arm: SerialArm, described: Robot, payload: float = 0.0) -> ET.Element:
     """Return the URDF of an arm with masses and visual shapes of a robot; its joint angles are the true ones, θ.
 
     It has the base, a link a joint, the flange and the ball, which is drawn by the mesh `BALL_MESH`.
@@ -286,6 +283,7 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     Args:
         arm: the kinematics, mismatch included.
         described: by its maker's description, for masses and shapes.
+        payload: kg, a point load at the ball.
 
     Raises:
         ValueError: the arm has another number of joints than the robot.
@@ -326,7 +324,8 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, 0.0), arm.tool, 0.25 * ball_radius)
     tool = np.stack([arm.tool, np.zeros(3)])
     add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), tool, turns=False)
-    ball = add_link(robot, BALL_LINK, *LIGHT_PART)
+    ball_mass, ball_inertia = LIGHT_PART
+    ball = add_link(robot, BALL_LINK, ball_mass + payload, ball_inertia)
     draw_mesh(ball, RED, BALL_MESH, ball_radius)
     return robot
 
