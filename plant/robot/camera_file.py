@@ -388,7 +388,7 @@ def _least_lens(lens: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[
     return lens, coefficients
 
 
-def stretch(coefficients: Sequence[float], s: FloatArray) -> FloatArray:
+def stretch(coefficients: Sequence[float], s: FloatArray) -> npt.NDArray[np.floating]:
     """Return the factor by which a lens without tangential distortion moves points away from the middle.
 
     Args:
@@ -397,13 +397,13 @@ def stretch(coefficients: Sequence[float], s: FloatArray) -> FloatArray:
     """
     if len(coefficients) == len(LENSES["equidistant"]):
         k1, k2, k3, k4 = coefficients
-        return 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
+        return np.polyval([k4, k3, k2, k1, 1.0], s)
     k1, k2, _, _, k3, *others = coefficients
-    above = 1.0 + s * (k1 + s * (k2 + s * k3))
+    above = np.polyval([k3, k2, k1, 1.0], s)
     if not others:
         return above
     k4, k5, k6 = others
-    return np.asarray(above / (1.0 + s * (k4 + s * (k5 + s * k6))))
+    return above / np.polyval([k6, k5, k4, 1.0], s)
 
 
 def turning_point(coefficients: Sequence[float]) -> float:
