@@ -184,8 +184,7 @@ class Shown(NamedTuple):
         return type(self)(feature, np.logical_or(self.valid, arrived), captured)
 
 
-@dataclass(frozen=True, eq=False)
-class BenchState:
+class BenchState(NamedTuple):
     """A saved state of a bench; it can be pickled if that of its world can."""
 
     period: int  # number of control periods since the reset
@@ -544,8 +543,9 @@ def build_bench(
         if step == setup.period:
             raise
         found = f"in sub-steps of {step:g} s, which the delays and the period need: {error}"
-        remedy = "run.period, command_delay and latency that are multiples of its own step help"
-        raise ValueError(f"{found}; {remedy}") from error
+        raise ValueError(
+            f"{found}; run.period, command_delay and latency that are multiples of its own step help"
+        ) from error
     command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
     camera = None if setup.model is None else setup.model.camera
     return Bench(world, command_delay, sensing, setup.period, camera)

@@ -112,10 +112,10 @@ class Abilities(ABC):
         Raises:
             ValueError: a plant without a camera that could be moved.
         """
-        wanted = (
-            "leave camera_move and camera_turn out, or define move_camera(self, X_BC) in its class"
+        raise ValueError(
+            "the plant has no camera that could be moved; leave camera_move and camera_turn out, or define "
+            "move_camera(self, X_BC) in its class"
         )
-        raise ValueError(f"the plant has no camera that could be moved; {wanted}")
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """Keep only some of the runs side by side and drop the others permanently.

@@ -88,7 +88,9 @@ def project(points: FloatArray, optics: Optics) -> FloatArray:
         b = _distorted(a, optics.distortion, optics.further)
         return centre + optics.focal_lengths[..., None, :] * b
     # vecdot does not take an array of expressions.
-    square = a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
+    x = a[..., 0]
+    y = a[..., 1]
+    square = x * x + y * y
     stretch = 1.0 + optics.distortion[..., None] * square
     return centre + (optics.focal[..., None] * stretch)[..., None] * a
 
@@ -107,7 +109,9 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
     across = motions[..., :2, :] - a[..., None] * motions[..., 2:, :]
     rate_a = across / depth[..., None]
     if optics.further is not None:
-        slope = _distortion_slope(a, optics.distortion, optics.further)
+        xx, xy, yy = _distortion_slopes(a, optics.distortion, optics.further)
+        rows = (np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1))
+        slope = np.stack(rows, axis=-2)
         return optics.focal_lengths[..., None, :, None] * (slope @ rate_a)
     # ∂((1 + k r²) a) = ∂a + k (r² ∂a + 2 a aᵀ ∂a)
     k = optics.distortion[..., None, None, None]
@@ -169,7 +173,9 @@ def _radial(a: FloatArray, k1: FloatArray, further: FloatArray) -> tuple[FloatAr
     """Return r², the radial factor of a, its derivative by r², (..., c, p) each, and p₁ and p₂, (..., c, 1)."""
     k1 = k1[..., None]
     k2, p1, p2, k3 = (further[..., i, None] for i in range(1, 5))
-    s = a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
+    x = a[..., 0]
+    y = a[..., 1]
+    s = x * x + y * y
     if further.shape[-1] == COLUMNS["equidistant"]:
         square = s + AXIS_OFFSET
         r = np.sqrt(square)
@@ -221,14 +227,6 @@ def _distortion_slopes(
     xy = 2.0 * x * y * change + 2.0 * p1 * x + 2.0 * p2 * y
     yy = stretch + 2.0 * y * y * change + 6.0 * p1 * y + 2.0 * p2 * x
     return xx, xy, yy
-
-
-def _distortion_slope(a: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
-    """Return ∂b/∂a, (..., c, p, 2, 2), of calibrated cameras."""
-    xx, xy, yy = _distortion_slopes(a, k1, further)
-    first_row = np.stack([xx, xy], axis=-1)
-    second_row = np.stack([xy, yy], axis=-1)
-    return np.stack([first_row, second_row], axis=-2)
 
 
 def _undistorted_polynomial(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:

@@ -35,7 +35,7 @@ from servobench.plant.robot.camera_file import OwnCamera, turning_point
 from servobench.plant.robot.hand_eye import rotation_matrix, turn_about
 from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.workspace import Workspace, camera_pose
+from servobench.plant.robot.workspace import camera_pose
 
 SIDE: Final = radians(60.0)  # angle of the second fixed camera's optical axis from the vertical
 HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
@@ -85,13 +85,8 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
 
 def _no_draws(count: int) -> CameraDraws:
     """Return the values of `count` cameras that are as planned."""
-    return CameraDraws(
-        np.ones(count),
-        np.zeros((count, 2)),
-        np.zeros(count),
-        np.zeros((count, 3)),
-        np.zeros((count, 3)),
-    )
+    no_turn = np.zeros((count, 3))
+    return CameraDraws(np.ones(count), np.zeros((count, 2)), np.zeros(count), no_turn, no_turn)
 
 
 def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
@@ -221,13 +216,9 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
     if own is not None and own.keys.pose.frame:
         described = own.pair[: setup.cameras]
         return np.stack([camera.keys.pose.matrix for camera in described])
-    if mount == "fixed":
-        return _planned_fixed_cameras(setup, robot.workspace)
-    return _planned_hand_cameras(setup, robot)
-
-
-def _planned_fixed_cameras(setup: SensingSetup, work: Workspace) -> FloatArray:
-    """Return the poses of one or two cameras beside the arm, (c, 4, 4), in the base frame."""
+    if mount == "hand":
+        return _planned_hand_cameras(setup, robot)
+    work = robot.workspace
     distance = setup.closeness * work.camera_distance
     above = work.camera_pose()[:3, :3]
     front = rotation_matrix([0.0, SIDE, 0.0]) @ above

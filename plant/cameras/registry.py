@@ -18,9 +18,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample
 from servobench.plant.robot.robot import Robot
 
-SETUPS: Final[Mapping[str, SensingSetup]] = {
-    setup.name: setup for setup in (POSITION, PIXEL, STEREO, PLATE)
-}
+SETUPS: Final = {setup.name: setup for setup in (POSITION, PIXEL, STEREO, PLATE)}
 FIXED: Final = "fixed"
 HAND: Final = "hand"
 DEFAULT_SENSING: Final = "position"

@@ -97,9 +97,9 @@ class SensingSetup:
         if not self.features:
             raise ValueError(f"sensing {self.name}: features must be one name or more, got none")
         if self.scale is None and self.unit not in EXTENTS:
-            wanted = "scale=lambda focal, distance: NUMBER, by how much they change with a metre of motion"
             raise ValueError(
-                f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}"
+                f"sensing {self.name}: features in {self.unit} need their natural size; give scale=lambda "
+                "focal, distance: NUMBER, by how much they change with a metre of motion"
             )
         count = self.cameras * len(self.target)
         if self.single and self.m % count:
@@ -188,17 +188,14 @@ class SensingSetup:
         self._check_array("rates", rates, (CHECK_POSES, self.m, 2), points)
         same_points = np.array_equal(given_points, points)
         if not (same_points and np.array_equal(given_motions, motions)):
-            wanted = "must not change their arguments; work on a copy, such as points.copy()"
-            raise ConfigurationError(f"sensing {self.name}: measure and rates {wanted}")
+            raise ConfigurationError(
+                f"sensing {self.name}: measure and rates must not change their arguments; work on a copy, such as "
+                "points.copy()"
+            )
         differences = self._differences(points, motions, optics, COARSE_STEP)
-        if self.rates is not None:
-            self._check_rates(rates, differences)
-
-    def _check_rates(self, rates: FloatArray, differences: FloatArray) -> None:
-        """Refuse `rates` that differ from the differences of `measure`, both (k, m, 2)."""
         wrong = np.abs(rates - differences).max(axis=(0, 2))
         bound = RATE_TOLERANCE * np.abs(differences).max()
-        if not (wrong <= bound).all():
+        if self.rates is not None and not (wrong <= bound).all():
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"

@@ -182,18 +182,14 @@ def _shows_front(points: Expressions) -> SX:
 
 def symbolic_rotation(rpy: SX) -> SX:
     """Return Rz(yaw) Ry(pitch) Rx(roll), (3, 3), as `servobench.plant.robot.arm.rotation_from_rpy`."""
-    c: SX = casadi.cos(rpy)
-    s: SX = casadi.sin(rpy)
-    turn_x = _matrix(
-        (1, 0, 0),
-        (0, c[0], -s[0]),
-        (0, s[0], c[0]),
-    )
-    turn_y = _matrix(
-        (c[1], 0, s[1]),
-        (0, 1, 0),
-        (-s[1], 0, c[1]),
-    )
+    cosines: SX = casadi.cos(rpy)
+    sines: SX = casadi.sin(rpy)
+    c = cosines[0]
+    s = sines[0]
+    turn_x = casadi.blockcat([[1, 0, 0], [0, c, -s], [0, s, c]])
+    c = cosines[1]
+    s = sines[1]
+    turn_y = casadi.blockcat([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     return _turn_z(rpy[2]) @ turn_y @ turn_x
 
 
@@ -201,13 +197,4 @@ def _turn_z(angle: SX) -> SX:
     """Return Rz(angle), (3, 3)."""
     c = casadi.cos(angle)
     s = casadi.sin(angle)
-    return _matrix(
-        (c, -s, 0),
-        (s, c, 0),
-        (0, 0, 1),
-    )
-
-
-def _matrix(*rows: tuple[SX, ...]) -> SX:
-    """Return the matrix of rows of expressions and numbers."""
-    return casadi.vertcat(*(casadi.horzcat(*row) for row in rows))
+    return casadi.blockcat([[c, -s, 0], [s, c, 0], [0, 0, 1]])

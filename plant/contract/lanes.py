@@ -139,11 +139,9 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
 def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
     """Return `one` in the chosen lanes, (...), and `other` elsewhere; both may have further axes."""
     mask = np.asarray(chosen)
-    return np.where(
-        mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)),
-        one,
-        other,
-    )
+    further = max(np.ndim(one), np.ndim(other)) - mask.ndim
+    mask = mask.reshape(mask.shape + (1,) * further)
+    return np.where(mask, one, other)
 
 
 def outer(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -170,7 +170,7 @@ class SensorAxis(NamedTuple):
     family: Family | None = None  # the family of noise that it chooses; None for none
 
 
-SENSOR_AXES: Final[Mapping[str, SensorAxis]] = {
+SENSOR_AXES: Final = {
     "mixture": SensorAxis(SHARE, "10%", "noise_share", "mixture"),
     "bimodal": SensorAxis(SHARE, "10%", "noise_share", "bimodal"),
     "stable": SensorAxis(NUMBER, "1.5", "stability", "stable"),

@@ -162,7 +162,7 @@ File: TypeAlias = Annotated[
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
-REMARKS: Final[list[str]] = []  # remarks that this worker process keeps for its parent
+REMARKS: Final = list[str]()  # remarks that this worker process keeps for its parent
 MAX_LISTED = 40  # number of names in an error message
 _BOUNDS = {
     "greater_than": ("gt", "above", operator.gt),

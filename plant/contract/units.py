@@ -5,14 +5,11 @@ A setting's own unit stands in brackets at the beginning of the string below its
 
 import math
 import re
-from collections.abc import Mapping
 from typing import Final
 
 DEGREES: Final = 180.0 / math.pi
 EXTENT: Final = "m or px"  # own unit of lengths that are pixels where features are pixels
-UNITS: Final[
-    Mapping[str, Mapping[str, float]]
-] = {  # own unit -> unit -> how many of it are one of the own unit
+UNITS: Final = {  # own unit -> unit -> how many of it are one of the own unit
     "s": {"s": 1.0, "ms": 1e3, "us": 1e6, "min": 1.0 / 60.0},
     "m": {"m": 1.0, "cm": 1e2, "mm": 1e3},
     EXTENT: {"m": 1.0, "cm": 1e2, "mm": 1e3, "px": 1.0},
@@ -24,7 +21,7 @@ UNITS: Final[
     "kg": {"kg": 1.0, "g": 1e3},
     "Hz": {"Hz": 1.0, "kHz": 1e-3},
 }
-RATES: Final[Mapping[str, str]] = {"Hz": "s"}  # unit -> own unit of which it is the reciprocal
+RATES: Final = {"Hz": "s"}  # unit -> own unit of which it is the reciprocal
 SPELLINGS: Final = str.maketrans({"°": "deg", "µ": "u", "μ": "u"})
 NUMBER: Final = r"(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 QUANTITY: Final = re.compile(rf"([-+]?{NUMBER})(?:\s*/\s*({NUMBER}))?\s*(.*)", re.IGNORECASE)

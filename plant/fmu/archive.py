@@ -59,7 +59,11 @@ def _extract(path: Path, folder: Path) -> None:
     with archive:
         entries = archive.infolist()
         for entry in entries:
-            entry.filename = _place_of(entry)
+            # Folders end with `/`, and letters may be in UTF-8 without a mark.
+            if not entry.flag_bits & UTF8_MARK:
+                with contextlib.suppress(UnicodeError):
+                    entry.filename = entry.filename.encode(USUAL_ENCODING).decode("utf-8")
+            entry.filename = entry.filename.replace("\\", "/")
         _check_names(path, entries)
         _check_sizes(path, entries)
         for entry in entries:
@@ -71,15 +75,6 @@ def _extract(path: Path, folder: Path) -> None:
                 raise ValueError(
                     f"fmu file {path} cannot be extracted: {entry.filename!r}: {error}"
                 ) from error
-
-
-def _place_of(entry: zipfile.ZipInfo) -> str:
-    """Return the name of an entry with `/` between folders, and its letters also of UTF-8 without a mark."""
-    name = entry.filename
-    if not entry.flag_bits & UTF8_MARK:
-        with contextlib.suppress(UnicodeError):
-            name = name.encode(USUAL_ENCODING).decode("utf-8")
-    return name.replace("\\", "/")
 
 
 def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:

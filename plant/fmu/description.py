@@ -98,11 +98,9 @@ class FmuDescription:
                 family = match[1] + match[3]
                 index = tuple(int(part) for part in match[2].split(","))
                 families.setdefault(family, []).append((index, variable))
-        members = {}
-        for name, pairs in families.items():
-            in_order = sorted(pairs, key=itemgetter(0))
-            members[name] = [variable for _, variable in in_order]
-        return members
+        for pairs in families.values():
+            pairs.sort(key=itemgetter(0))
+        return {name: [variable for _, variable in pairs] for name, pairs in families.items()}
 
     def find(
         self, name: str, role: str, types: Container[str] | None = REAL_TYPES
@@ -247,16 +245,22 @@ def read_exchange(path: Path, root: Path) -> None:
     description = parse_description(path, root)
     version = str(description.fmiVersion)
     exchange = description.modelExchange
-    wanted = "wanted FMI 2 with model exchange and directional derivatives"
-    hidden = "so its Jacobian cannot be read"
+    lack = ""
     if not version.startswith("2."):
-        raise ValueError(f"fmu file {path} is of FMI {version}, {hidden}; {wanted}")
-    if exchange is None:
-        raise ValueError(f"fmu file {path} offers no model exchange, {hidden}; {wanted}")
-    if not exchange.providesDirectionalDerivative:
-        raise ValueError(f"fmu file {path} has no directional derivatives, {hidden}; {wanted}")
+        lack = f"is of FMI {version}"
+    elif exchange is None:
+        lack = "offers no model exchange"
+    elif not exchange.providesDirectionalDerivative:
+        lack = "has no directional derivatives"
+    if lack:
+        raise ValueError(
+            f"fmu file {path} {lack}, so its Jacobian cannot be read; wanted FMI 2 with model exchange and directional "
+            "derivatives"
+        )
     if exchange.canBeInstantiatedOnlyOncePerProcess:
-        raise ValueError(f"fmu file {path} allows one instance in a process, {hidden} during a run")
+        raise ValueError(
+            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read during a run"
+        )
 
 
 def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's classes carry no usable types

@@ -6,18 +6,12 @@ whose arguments differ are methods of the classes in `plant.fmu.instances`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
-import numpy as np
+from servobench.plant.contract.facts import read_facts
 
-# Type of a variable -> word in the names of functions, type in memory
-Kinds: TypeAlias = Mapping[str, tuple[str, Any]]
 # For settings.
 FmiVersion: TypeAlias = Literal[2, 3]
-# Whole numbers of FMI 3 -> their type in memory.
-WHOLE_TYPES: Final = {
-    f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)
-}
 
 
 @dataclass(frozen=True)
@@ -31,46 +25,16 @@ class FmiDialect:
     system_folders: bool
     # Word for real numbers in the names of the functions that read and write them.
     real: str
-    kinds: Kinds  # the same word for each numeric type, and how its numbers lie in memory
+    # The same word for each numeric type of variables, and numpy's name of its numbers in memory
+    kinds: Mapping[str, tuple[str, str]]
     state: str  # word for states in the names of functions and capabilities
     deserialise: str  # the verb of the function that reads a state from bytes
     derivatives: str  # name of the function that reads the states' derivatives
     early: str  # word for a step that ended early, in messages
 
 
-FMI2: Final = FmiDialect(
-    version=2,
-    prefix="fmi2",
-    token="guid",
-    system_folders=True,
-    real="Real",
-    kinds={
-        "Real": ("Real", np.float64),
-        "Integer": ("Integer", np.int32),
-        "Enumeration": ("Integer", np.int32),
-        "Boolean": ("Boolean", np.int32),
-    },
-    state="FMUstate",
-    deserialise="DeSerialize",
-    derivatives="GetDerivatives",
-    early="discard",
-)
-FMI3: Final = FmiDialect(
-    version=3,
-    prefix="fmi3",
-    token="instantiationToken",
-    system_folders=False,
-    real="Float64",
-    kinds={
-        "Float64": ("Float64", np.float64),
-        "Float32": ("Float32", np.float32),
-        **{word: (word, kind) for word, kind in WHOLE_TYPES.items()},
-        "Enumeration": ("Int64", np.int64),
-        "Boolean": ("Boolean", np.bool_),
-    },
-    state="FMUState",
-    deserialise="Deserialize",
-    derivatives="GetContinuousStateDerivatives",
-    early="early",
-)
+FMI: Final = read_facts("fmi")
+FMI2: Final = FmiDialect(**FMI["fmi2"])
+FMI3: Final = FmiDialect(**FMI["fmi3"])
+INTEGERS: Final = FMI["integers"]
 DIALECTS: Final = {dialect.version: dialect for dialect in (FMI2, FMI3)}

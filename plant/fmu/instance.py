@@ -82,6 +82,7 @@ class Instance(ABC):
     """One instance of an FMU."""
 
     dialect: ClassVar[FmiDialect]  # the version of FMI
+    boolean: ClassVar[type[ctypes.c_int | ctypes.c_bool]]  # its truth values, for C
 
     def __init__(
         self, description: FmuDescription, tolerance: float | None, debug_log: Path | None
@@ -110,14 +111,20 @@ class Instance(ABC):
 
     def start(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
-        self._initialise(time)
+        has_tolerance = self.boolean(self.tolerance is not None)
+        tolerance = ctypes.c_double(self.tolerance or 0.0)
+        start = ctypes.c_double(time)
+        has_stop = self.boolean(False)
+        stop = ctypes.c_double()
+        self._enter_initialisation(has_tolerance, tolerance, start, has_stop, stop)
+        self.call("ExitInitializationMode")
         if self.description.exchange:
             self._integrator = Integrator(self)
         self._begun = True
 
     @abstractmethod
-    def _initialise(self, time: float) -> None:
-        """Go through initialisation, to begin at `time`."""
+    def _enter_initialisation(self, *experiment: Any) -> None:  # noqa: ANN401 - types of C
+        """Begin initialisation for an experiment: tolerance, start and stop time as the standard has them."""
 
     @abstractmethod
     def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
@@ -455,26 +462,26 @@ class Integrator:
             raise self._fault
 
     def _make(self, time: float) -> Any:  # noqa: ANN401 - fmpy's solver carries no types
+        instance = self._instance
+        description = instance.description
         try:
             from fmpy.sundials import CVodeSolver  # noqa: PLC0415 - a library that not every platform has
         except OSError as error:
-            name = self._instance.description.path.name
             raise FmuError(
-                f"{name} offers model exchange only, and fmpy has no solver for this machine"
+                f"{description.path.name} offers model exchange only, and fmpy has no solver for this machine"
             ) from error
-        instance = self._instance
-        derivatives = instance.dialect.derivatives
+        set_time = self._guarded(lambda now: instance.call("SetTime", ctypes.c_double(now)))
         # Inputs stay as they are within a step.
         held_inputs = SimpleNamespace(apply=lambda _time: None)
         return CVodeSolver(
-            nx=instance.description.n_states,
-            nz=instance.description.n_indicators,
+            nx=description.n_states,
+            nz=description.n_indicators,
             get_x=self._vector("GetContinuousStates"),
             set_x=self._vector("SetContinuousStates"),
-            get_dx=self._vector(derivatives),
+            get_dx=self._vector(instance.dialect.derivatives),
             get_z=self._vector("GetEventIndicators"),
             get_nominals=self._vector("GetNominalsOfContinuousStates"),
-            set_time=self._guarded(lambda now: instance.call("SetTime", ctypes.c_double(now))),
+            set_time=set_time,
             input=held_inputs,
             startTime=time,
             relativeTolerance=instance.tolerance or RELATIVE_TOLERANCE,

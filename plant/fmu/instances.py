@@ -9,7 +9,7 @@ import ctypes
 import math
 import os
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -138,11 +138,11 @@ _logs: weakref.WeakValueDictionary[int, MessageLog] = weakref.WeakValueDictionar
 
 
 def _log_message(
-    environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes
+    environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes | None
 ) -> None:
     """Pass a message to the log of the instance that it came from; the environment identifies it."""
     log = _logs.get(environment or 0) or MessageLog("fmu")
-    log.add(status, (message or b"").decode("utf-8", errors="replace"))
+    log.add(status, message)
 
 
 _on_message = _Logger(_log_message)
@@ -152,6 +152,7 @@ class Instance2(Instance):
     """One instance of an FMI 2.0 FMU."""
 
     dialect = FMI2
+    boolean = ctypes.c_int
 
     def _instantiate(self) -> int | None:
         self._callbacks = _callbacks(self.log)
@@ -160,27 +161,21 @@ class Instance2(Instance):
         description = self.description
         interface = MODEL_EXCHANGE if description.exchange else CO_SIMULATION
         resources = (plain_root(description.root) / "resources").as_uri()
-        invisible = ctypes.c_int(0)
+        invisible = 0
         address: int | None = create(
             description.model_name.encode(),
-            ctypes.c_int(interface),
+            interface,
             description.token.encode(),
             resources.encode(),
             ctypes.byref(self._callbacks),
             invisible,
-            ctypes.c_int(self._debugs),
+            int(self._debugs),
         )
         return address
 
-    def _initialise(self, time: float) -> None:
-        tolerance_defined = ctypes.c_int(self.tolerance is not None)
-        tolerance = ctypes.c_double(self.tolerance or 0.0)
-        stop_defined = ctypes.c_int(0)
-        stop = ctypes.c_double(0.0)
-        start = ctypes.c_double(time)
-        self.call("SetupExperiment", tolerance_defined, tolerance, start, stop_defined, stop)
+    def _enter_initialisation(self, *experiment: Any) -> None:  # noqa: ANN401 - types of C
+        self.call("SetupExperiment", *experiment)
         self.call("EnterInitializationMode")
-        self.call("ExitInitializationMode")
 
     def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         return partial(self.function("DoStep"), self._component, now, step, ctypes.c_int(1))
@@ -245,6 +240,7 @@ class Instance3(Instance):
     """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
 
     dialect = FMI3
+    boolean = ctypes.c_bool
 
     def _instantiate(self) -> int | None:
         log = self.log
@@ -254,9 +250,9 @@ class Instance3(Instance):
         self._last_time = ctypes.c_double()
 
         def on_message(
-            _environment: int | None, status: int, _category: bytes, message: bytes
+            _environment: int | None, status: int, _category: bytes, message: bytes | None
         ) -> None:
-            log.add(status, (message or b"").decode("utf-8", errors="replace"))
+            log.add(status, message)
 
         self._on_message = LogMessage(on_message)
         exchange = self.description.exchange
@@ -281,16 +277,8 @@ class Instance3(Instance):
         address: int | None = create(*arguments)
         return address
 
-    def _initialise(self, time: float) -> None:
-        tolerance_defined = ctypes.c_bool(self.tolerance is not None)
-        tolerance = ctypes.c_double(self.tolerance or 0.0)
-        stop_defined = ctypes.c_bool(False)
-        stop = ctypes.c_double(0.0)
-        start = ctypes.c_double(time)
-        self.call(
-            "EnterInitializationMode", tolerance_defined, tolerance, start, stop_defined, stop
-        )
-        self.call("ExitInitializationMode")
+    def _enter_initialisation(self, *experiment: Any) -> None:  # noqa: ANN401 - types of C
+        self.call("EnterInitializationMode", *experiment)
 
     def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         end = self._end
@@ -331,6 +319,4 @@ class Instance3(Instance):
         self.call("ExitConfigurationMode")
 
 
-INSTANCES: Final[Mapping[int, type[Instance2 | Instance3]]] = {
-    kind.dialect.version: kind for kind in (Instance2, Instance3)
-}
+INSTANCES: Final = {kind.dialect.version: kind for kind in (Instance2, Instance3)}

@@ -17,7 +17,8 @@ from servobench.plant.contract.files import accessing
 from servobench.plant.fmu.description import FmuDescription
 
 NOEXEC_REMEDY: Final = (
-    "so no code is loaded from it: let TMPDIR and XDG_CACHE_HOME name folders elsewhere"
+    "; it lies on a file system that is mounted noexec, so no code is loaded from it: let TMPDIR and XDG_CACHE_HOME "
+    "name folders elsewhere"
 )
 _fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
 
@@ -50,21 +51,16 @@ class Library:
                 except OSError as error:
                     remedy = ""
                     if forbids_code(file):
-                        remedy = (
-                            f"; it lies on a file system that is mounted noexec, {NOEXEC_REMEDY}"
-                        )
-                    what = (
+                        remedy = NOEXEC_REMEDY
+                    raise ValueError(
                         f"the library in {description.path.name} cannot be loaded: {error}{remedy}"
-                    )
-                    raise ValueError(what) from error
+                    ) from error
                 return
             if file.parent.is_dir():
-                there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
+                there = _names_in(file.parent) or "nothing"
                 raise ValueError(f"{lacking} binaries/{folder}/{wanted}, it has there: {there}")
-        there = ""
-        if binaries.is_dir():
-            there = ", ".join(sorted(folder.name for folder in binaries.iterdir()))
-        raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there or 'none'}")
+        there = _names_in(binaries) or "none"
+        raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there}")
 
     @property
     def condemned(self) -> bool:
@@ -84,18 +80,20 @@ class Library:
         self.loaded = None
 
 
+def _names_in(folder: Path) -> str:
+    """Return the names in a folder; none in one that is not there."""
+    return ", ".join(sorted(path.name for path in folder.glob("*")))
+
+
 def _load(file: Path, *, shared: bool) -> ctypes.CDLL:
-    """Load a library that may be shared by several instances, or a copy of it where it may not, or never again."""
-    if not shared:
-        return _load_copy(file)
-    library = ctypes.CDLL(str(file))
-    if library._handle in _fatal:
-        return _load_copy(file)
-    return library
+    """Load a library that may be shared by several instances.
 
-
-def _load_copy(file: Path) -> ctypes.CDLL:
-    """Load a copy of a library and of its folder, so that it shares no variables with another instance."""
+    Where it may not, or never again, it is a copy of it and of its folder, which shares no variables with another one.
+    """
+    if shared:
+        library = ctypes.CDLL(str(file))
+        if library._handle not in _fatal:
+            return library
     # The first folder from which code may be loaded; a truth value of False comes first.
     candidates = (Path(tempfile.gettempdir()), cache_folder(EXTRACTED))
     place = min(candidates, key=forbids_code)
@@ -151,9 +149,10 @@ class MessageLog:
             self._append(f"an instance of {name}")
         self._last: deque[str] = deque(maxlen=REMEMBERED_MESSAGES)
 
-    def add(self, status: int, message: str) -> None:
-        """Take a message with its status."""
-        text = " ".join(message.split())
+    def add(self, status: int, message: bytes | None) -> None:
+        """Take a message of C with its status."""
+        words = (message or b"").decode("utf-8", errors="replace")
+        text = " ".join(words.split())
         self._last.append(text)
         level = STATUS_LEVELS[status] if 0 <= status < len(STATUS_LEVELS) else logging.ERROR
         logger.log(level, "%s: %s", self._name, text)

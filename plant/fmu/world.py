@@ -7,11 +7,11 @@ are set before every run.
 
 import ctypes
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from math import prod
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +33,7 @@ from servobench.plant.fmu.description import (
     read_description,
     total_size,
 )
-from servobench.plant.fmu.dialect import WHOLE_TYPES
+from servobench.plant.fmu.dialect import INTEGERS
 from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
@@ -60,13 +60,9 @@ ARM_JOINTS: Final = ("joint_velocity_command", "joint_position")
 ARM_FEATURES: Final = ("ball_position", "feature")
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL: Final = "structuralParameter"
-INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32", **WHOLE_TYPES}
 EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
 
 Setter = Callable[[Instance, int], None]
-Given = tuple[
-    list[Variable], str, npt.NDArray[Any]
-]  # variables that a name stands for, and their values
 
 
 @settings
@@ -81,8 +77,7 @@ class FmuConfig:
     """Run the FMU in a process of its own, with limits; false only for one that you trust."""
 
 
-@dataclass(frozen=True, eq=False)
-class FmuState:
+class FmuState(NamedTuple):
     """A saved state of an FMU's world."""
 
     # The state of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
@@ -250,7 +245,11 @@ class FmuWorld(World):
         end = first + self.spec.m
         if self.faults or not is_finite(values):
             for i in np.flatnonzero(~np.isfinite(values).all(axis=-1)).tolist():
-                fault = self._not_finite(values.reshape(-1, values.shape[-1])[i])
+                row = values.reshape(-1, values.shape[-1])[i]
+                bad = np.array(self._result.labels)[~np.isfinite(row)]
+                fault = FmuError(
+                    f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}"
+                )
                 self._instances.drop(self._instances.lanes[i], fault)
             failed = list(self.faults)
             values[failed, first:end] = self._feature[failed]
@@ -262,16 +261,6 @@ class FmuWorld(World):
             self._seen = values[..., end : end + self.spec.m] > SEEN_ABOVE
         if self.stamps:
             self._captured = values[..., -1]
-
-    def _not_finite(self, values: FloatArray) -> FmuError:
-        """Return the fault of a row of results, which names those that are not finite."""
-        bad = []
-        for label, value in zip(self._result.labels, values, strict=True):
-            if not np.isfinite(value):
-                bad.append(label)
-        return FmuError(
-            f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}"
-        )
 
     def see(self) -> FloatArray:
         """Return the FMU's features as read after the last step."""
@@ -311,8 +300,10 @@ class FmuWorld(World):
                 )
         if jumps:
             found = f"{self.description.path.name} returns 0 at the start for what then jumps though the arm rests"
-            remedy = "let it compute its outputs in the initialisation, too, or map `seen`"
-            remark(f"{found}: {', '.join(jumps)}; runs begin with a wrong measurement: {remedy}")
+            remark(
+                f"{found}: {', '.join(jumps)}; runs begin with a wrong measurement: let it compute its outputs in "
+                "the initialisation, too, or map `seen`"
+            )
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """Set the parameters of the camera's pose; see `Plant.move_camera`.
@@ -457,7 +448,10 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
         bounds = np.iinfo(INTEGERS[kind])
         low = max(int(bounds.min), -EXACT)
         high = min(int(bounds.max), EXACT)
-        fits = given.dtype.kind == "f" and _whole_within(given, low, high)
+        fits = given.dtype.kind == "f"
+        if fits:
+            within = (low <= given) & (given <= high)
+            fits = bool((within & (given == np.round(given))).all())
         wanted = f"a whole number from {low} to {high}"
     elif kind in REAL_TYPES:
         fits = given.dtype.kind == "f"
@@ -466,13 +460,6 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
         raise ValueError(f"parameter {name!r} is of type {kind}, which a mapping cannot set")
     if not fits:
         raise ValueError(f"parameter {name!r} is of type {kind}: wanted {wanted}, got {came!r}")
-
-
-def _whole_within(values: FloatArray, low: int, high: int) -> bool:
-    """Return whether all numbers are whole and within bounds, both included."""
-    whole = values == np.round(values)
-    within = (values >= low) & (values <= high)
-    return bool((whole & within).all())
 
 
 def setters(
@@ -490,19 +477,19 @@ def setters(
     Raises:
         ValueError: a value of the wrong type or size.
     """
-    sizes: list[Given] = []
-    others: list[Given] = []
+    sizes = list[Setter]()
+    others = list[Setter]()
     for name, value in parameters.items():
         variables = description.find(name, "parameters", None)
+        check_value(variables, name, value)
         group = sizes if variables[0].causality == STRUCTURAL else others
-        group.append((variables, name, value))
-    return [_setter(variables, name, value, lead) for variables, name, value in sizes + others]
+        group.append(_setter(variables, name, value, lead))
+    return sizes + others
 
 
 def _setter(
     variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]
 ) -> Setter:
-    check_value(variables, name, value)
     size = total_size(variables)
     given = np.asarray(value)
     if given.shape not in ((), (size,), (*lead, size)):
@@ -579,16 +566,17 @@ def _exported_arm(path: Path) -> FmuMapping:
     units = {variable.name.partition("[")[0]: variable.unit for variable in description.variables}
     features = [name for name in ARM_FEATURES if name in units]
     if not (features and {*ARM_JOINTS, "jacobian"} <= units.keys()):
-        keys = "its file, inputs and features"
         raise ValueError(
-            f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names {keys}"
+            f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names its file, "
+            "inputs and features"
         )
+    command, position = ARM_JOINTS
+    feature = features[0]
+    seen: Names = ()
+    if "seen" in units:
+        seen = ("seen",)
+    truth = TruthMapping(jacobian=("jacobian",))
+    names = LogNames(feature_unit=units[feature])
     return FmuMapping(
-        path,
-        inputs=ARM_JOINTS[:1],
-        joints=ARM_JOINTS[1:],
-        features=tuple(features[:1]),
-        seen=tuple(name for name in ("seen",) if name in units),
-        truth=TruthMapping(jacobian=("jacobian",)),
-        names=LogNames(feature_unit=units[features[0]]),
+        path, (command,), (feature,), joints=(position,), seen=seen, truth=truth, names=names
     )

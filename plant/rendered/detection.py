@@ -11,7 +11,6 @@ where that slope grows without bound, and pixels whose residual stands far off t
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import cv2
@@ -50,16 +49,24 @@ OUTLINE = (40, 255, 80)  # RGB of the drawn detection
 MARGIN = 6
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
+class Patch(NamedTuple):
     """The largest red patch in an image."""
 
     rows: IntArray  # (k,), px
     columns: IntArray  # (k,), px
 
+    def mask(self, margin: int = 0) -> tuple[ByteArray, int, int]:
+        """Return a mask of the box around the pixels with a margin [px], and the box's first row and column."""
+        top = int(self.rows.min()) - margin
+        left = int(self.columns.min()) - margin
+        bottom = int(self.rows.max()) + 1 + margin
+        right = int(self.columns.max()) + 1 + margin
+        mask = np.zeros((bottom - top, right - left), dtype=np.uint8)
+        mask[self.rows - top, self.columns - left] = 1
+        return mask, top, left
 
-@dataclass(frozen=True, eq=False)
-class Detection:
+
+class Detection(NamedTuple):
     """A ball as a sphere of known radius fitted to depths."""
 
     centre: FloatArray  # (3,), m, camera frame
@@ -331,26 +338,25 @@ def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> W
         radius: [m].
         camera: its intrinsics.
     """
-    x, y, z = centre.tolist()
+    across = centre[:2]
+    z = float(centre[2])
     if z < -radius:
         return None
     if z <= radius + camera.near:
         return whole(camera)
     depth2 = z * z - radius * radius
-    wide = math.sqrt(x * x + depth2)
-    high = math.sqrt(y * y + depth2)
-    lower_end = [(x * z - radius * wide) / depth2, (y * z - radius * high) / depth2, 1.0]
-    upper_end = [(x * z + radius * wide) / depth2, (y * z + radius * high) / depth2, 1.0]
-    (left, top), (right, bottom) = camera.project([lower_end, upper_end]).tolist()
-    window = Window(
-        top=max(0, math.floor(top) - MARGIN),
-        left=max(0, math.floor(left) - MARGIN),
-        bottom=min(camera.height, math.ceil(bottom) + 1 + MARGIN),
-        right=min(camera.width, math.ceil(right) + 1 + MARGIN),
-    )
-    if window.top >= window.bottom or window.left >= window.right:
+    half = radius * np.sqrt(across * across + depth2)
+    ends = np.ones((2, 3))
+    ends[0, :2] = (across * z - half) / depth2
+    ends[1, :2] = (across * z + half) / depth2
+    lower, upper = camera.project(ends)
+    first = np.floor(lower) - MARGIN
+    beyond = np.ceil(upper) + 1 + MARGIN
+    left, top = np.maximum(first, 0).astype(int).tolist()
+    right, bottom = np.minimum(beyond, (camera.width, camera.height)).astype(int).tolist()
+    if top >= bottom or left >= right:
         return None
-    return window
+    return Window(top, left, bottom, right)
 
 
 def window_around_all(centres: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
@@ -359,9 +365,5 @@ def window_around_all(centres: FloatArray, radius: float, camera: PinholeCamera)
     shown = [window for window in windows if window is not None]
     if not shown:
         return None
-    return Window(
-        top=min(window.top for window in shown),
-        left=min(window.left for window in shown),
-        bottom=max(window.bottom for window in shown),
-        right=max(window.right for window in shown),
-    )
+    tops, lefts, bottoms, rights = zip(*shown, strict=True)
+    return Window(min(tops), min(lefts), max(bottoms), max(rights))

@@ -169,12 +169,10 @@ def as_planned(optics: Optics, planned: PinholeCamera) -> bool:
     if optics.further is not None:
         return False
     plain = ideal_optics(planned, 1)
-    pairs = (
-        (optics.focal, plain.focal),
-        (optics.centre, plain.centre),
-        (optics.distortion, plain.distortion),
-    )
-    return all(np.allclose(own, ideal, rtol=1e-12, atol=0.0) for own, ideal in pairs)
+    for name in ("focal", "centre", "distortion"):
+        if not np.allclose(getattr(optics, name), getattr(plain, name), rtol=1e-12, atol=0.0):
+            return False
+    return True
 
 
 def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
@@ -365,17 +363,13 @@ class MarkCameras:
     def _measure(self, marks: Sequence[Sequence[Mark | None]]) -> tuple[BoolArray, FloatArray]:
         """Return which marks are found, (c, p), and where, (c, p, 2) px; the middle of the image for the others."""
         middle = np.array([self._planned.width, self._planned.height]) / 2.0
-        found = [[mark is not None for mark in row] for row in marks]
-        pixels = []
-        for row in marks:
-            centres = []
-            for mark in row:
-                centre = middle
+        found = np.array([[mark is not None for mark in row] for row in marks])
+        pixels = np.full((*found.shape, 2), middle)
+        for camera, row in enumerate(marks):
+            for point, mark in enumerate(row):
                 if mark is not None:
-                    centre = self._centre(mark, self._planned)
-                centres.append(centre)
-            pixels.append(centres)
-        return np.array(found), np.array(pixels)
+                    pixels[camera, point] = self._centre(mark, self._planned)
+        return found, pixels
 
 
 @final

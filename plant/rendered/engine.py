@@ -5,7 +5,6 @@ Joint angles here are the true ones, θ; the world frame W is the arm's base fra
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from servobench.plant.contract.checks import FloatArray
@@ -58,8 +57,7 @@ class Scene(ABC):
         """Close the engine's world; calling it twice is allowed."""
 
 
-@dataclass(frozen=True, eq=False)
-class Machine:
+class Machine(NamedTuple):
     """The parts that a simulation is built from."""
 
     arm: SerialArm  # the true kinematics

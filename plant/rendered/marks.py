@@ -27,7 +27,7 @@ from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, 
 from servobench.plant.robot.camera import IntArray, PinholeCamera
 
 Colour = tuple[float, float, float, float]  # red, green, blue and opacity, each up to 1
-RED: Final[Colour] = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
+RED: Final = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
 
 
 class MarkColour(NamedTuple):
@@ -105,11 +105,8 @@ def _whole_mark(patch: Patch | None, others: Sequence[cv2.typing.MatLike]) -> Pa
 
 def _hull(patch: Patch) -> Patch:
     """Return the pixels of the convex hull of a patch."""
-    left = patch.columns.min()
-    top = patch.rows.min()
+    box, top, left = patch.mask()
     points = np.stack([patch.columns - left, patch.rows - top], axis=-1).astype(np.int32)
-    width, height = points.max(axis=0) + 1
-    box = np.zeros((height, width), dtype=np.uint8)
     filled = cv2.fillConvexPoly(box, cv2.convexHull(points), 1)
     rows, columns = np.nonzero(filled)
     return Patch(rows + top, columns + left)
@@ -123,12 +120,9 @@ def fills_ellipse(patch: Patch) -> bool:
     half_axes = ELLIPSE * np.sqrt(np.maximum(variances, 0.0))
     if half_axes[0] < MIN_HALF_AXIS:
         return False
-    left = patch.columns.min()
-    top = patch.rows.min()
-    width = patch.columns.max() - left + 1
-    height = patch.rows.max() - top + 1
-    filled = np.zeros((height, width), dtype=np.bool_)
-    filled[patch.rows - top, patch.columns - left] = True
+    mask, top, left = patch.mask()
+    filled = mask > 0
+    height, width = filled.shape
     # Pixels of the patch's box along the axes of its ellipse.
     box = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     along_axes = (box + np.array([left, top]) - middle) @ axes
@@ -142,22 +136,18 @@ def fills_ellipse(patch: Patch) -> bool:
 def _with_shares(patch: Patch, whole: Patch, rgb: ByteArray, paint: Colour) -> Mark:
     """Return the mark of a patch, with its share of each pixel of the whole mark and of their neighbours."""
     # The box has a border of one pixel for the neighbours; no patch touches the border of the image.
-    top = patch.rows.min() - 1
-    left = patch.columns.min() - 1
-    bottom = patch.rows.max() + 2
-    right = patch.columns.max() + 2
-    colour = rgb[top:bottom, left:right, :3].astype(np.float64)
+    in_mark, top, left = whole.mask(margin=1)
+    height, width = in_mark.shape
+    colour = rgb[top : top + height, left : left + width, :3].astype(np.float64)
     grey = colour.mean(axis=-1, keepdims=True)
     towards_paint = np.array(paint[:3]) - np.mean(paint[:3])
     amount = np.maximum((colour - grey) @ towards_paint, 0.0)
     largest = np.asarray(cv2.dilate(amount, NEIGHBOURS))
     shares = amount / np.maximum(largest, 1e-9)
-    in_mark = np.zeros(amount.shape, dtype=np.uint8)
-    in_mark[whole.rows - top, whole.columns - left] = 1
     # Pixels of a notch, away from the edge, belong to the mark as a whole, and so do their neighbours within it.
     notch = cv2.erode(in_mark, NEIGHBOURS)
     notch[patch.rows - top, patch.columns - left] = 0
-    about_notch = (cv2.dilate(notch, NEIGHBOURS) & in_mark) > 0
+    about_notch = cv2.bitwise_and(cv2.dilate(notch, NEIGHBOURS), in_mark) > 0
     shares[about_notch] = 1.0
     rows, columns = np.nonzero(cv2.dilate(in_mark, NEIGHBOURS))
     return Mark(rows + top, columns + left, shares[rows, columns])

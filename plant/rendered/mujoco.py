@@ -13,7 +13,6 @@ import ctypes
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
@@ -104,19 +103,6 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
         ) from error
 
 
-@contextmanager
-def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
-    """Restrict OpenGL in the current context to a rectangle of pixels, counted from the lower left corner."""
-    from OpenGL import GL  # noqa: PLC0415 - chooses the platform that `open_context` has loaded
-
-    GL.glEnable(GL.GL_SCISSOR_TEST)
-    GL.glScissor(left, bottom, width, height)
-    try:
-        yield
-    finally:
-        GL.glDisable(GL.GL_SCISSOR_TEST)
-
-
 @cache
 def missing_renderer() -> str:
     """Return a line about missing parts of this machine for images; empty if nothing is missing."""
@@ -196,6 +182,8 @@ class MujocoScene(Scene):
 
         Depths fall from 1 at the near plane to 0 at the far one, where float32 is finest.
         """
+        from OpenGL import GL  # noqa: PLC0415 - chooses the platform that `open_context` has loaded
+
         self._leave_out(camera, X_BC, window)
         kinds = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(
@@ -209,7 +197,10 @@ class MujocoScene(Scene):
         rgb = np.empty((height, width, 3), dtype=np.uint8)
         depth = np.empty((height, width), dtype=np.float32)
         context = self._context
-        with self._gl.as_current(), scissors(*part):
+        with self._gl.as_current():
+            # No other pixels are filled.
+            GL.glEnable(GL.GL_SCISSOR_TEST)
+            GL.glScissor(*part)
             if camera.width > context.offWidth or camera.height > context.offHeight:
                 wider = max(camera.width, context.offWidth)
                 higher = max(camera.height, context.offHeight)

@@ -59,10 +59,8 @@ class Room:
         """Return the files of the arm with its target or cameras, and of a target in the world."""
         tree = urdf.arm_tree(self.arm, self.robot)
         model = self.model
-        if model is None:
-            return {"arm.urdf": urdf.text(tree)}
-        fixed = model.mount == "fixed"
-        if fixed and len(model.target) == 1:  # the ball, which every arm carries
+        fixed = model is None or model.mount == "fixed"
+        if model is None or (fixed and len(model.target) == 1):  # the ball, which every arm carries
             return {"arm.urdf": urdf.text(tree)}
         # The flange carries the plate or the cameras in the place of the ball.
         (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
@@ -96,11 +94,11 @@ class Room:
             normal = np.cross(points[1] - points[0], points[2] - points[0])
         length = np.linalg.norm(normal)
         if len(points) > len(MARK_COLOURS) or not length > 1e-9:
-            wanted = (
-                "a ball, of one point, or a plate with three or four discs that are not in line"
-            )
             came = f"sensing {model.setup.name} has a target of {len(points)} points"
-            raise ValueError(f"{came}; only these can be drawn: {wanted}")
+            raise ValueError(
+                f"{came}; only these can be drawn: a ball, of one point, or a plate with three or four discs that "
+                "are not in line"
+            )
         scale = target_scale(model, self.robot)
         # One layer away from the side of the discs: first discs, then pads, then the rods from the middle.
         back = LAYER * scale * (normal / length)
@@ -149,7 +147,13 @@ class Overview:
         """
         position = np.array(OVERVIEW_POSITION)
         target = np.array(OVERVIEW_TARGET)
-        pose = _look_at(scale * position, scale * target)
+        towards = scale * target - scale * position
+        z = towards / np.linalg.norm(towards)
+        x = np.cross(z, [0.0, 0.0, 1.0])  # The horizon is level.
+        x /= np.linalg.norm(x)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
+        pose[:3, 3] = scale * position
         distance = scale * float(np.linalg.norm(position - target))
         width = round(fineness * OVERVIEW_CAMERA.width)
         height = round(fineness * OVERVIEW_CAMERA.height)
@@ -161,16 +165,3 @@ class Overview:
         R_BC = self.X_BC[:3, :3]
         p_C = (points - self.X_BC[:3, 3]) @ R_BC
         return self.camera.project(p_C), p_C[:, 2]
-
-
-def _look_at(position: FloatArray, target: FloatArray) -> FloatArray:
-    """Return X_BC, (4, 4), of a camera at `position` directed at `target`, both (3,) m, with the horizon level."""
-    towards = target - position
-    z = towards / np.linalg.norm(towards)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, y, z], axis=-1)
-    pose[:3, 3] = position
-    return pose

@@ -27,6 +27,7 @@ from servobench.plant.robot.robot import Robot
 RATED_PAYLOAD = 5.0  # [kg] a UR5's, by its maker
 BoxNumbers = Annotated[tuple[Annotated[Number, Usual(20.0)], ...], Len(6, 6)]
 Load = Annotated[NonNegative, Usual(100.0)]
+Losses = Annotated[tuple[NonNegative, ...], Only(dynamics=True)]
 
 
 class Box(NamedTuple):
@@ -54,9 +55,9 @@ class DriveConfig:
     """[Hz] of each velocity loop; rises in about 50 ms."""
     torque_limit: Annotated[tuple[Positive, ...], Only(dynamics=True)] = ur5.MAX_TORQUE
     """[Nm] of each joint; Universal Robots, "Max. joint torques"."""
-    rotor_inertia: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (0.1,)
+    rotor_inertia: Losses = (0.1,)
     """[kg m²] seen at the joint (rotor times gear ratio squared); UR5e in MuJoCo Menagerie."""
-    coulomb_friction: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (
+    coulomb_friction: Losses = (
         7.5,
         7.5,
         7.5,
@@ -65,7 +66,7 @@ class DriveConfig:
         1.4,
     )
     """[Nm] 5 % of the torque limit; order of magnitude for strain-wave gears."""
-    viscous_friction: Annotated[tuple[NonNegative, ...], Only(dynamics=True)] = (
+    viscous_friction: Losses = (
         7.5,
         7.5,
         7.5,
@@ -87,15 +88,8 @@ class DriveConfig:
         Raises:
             ValueError: a list of another length.
         """
-        lists = {
-            "velocity_bandwidth": self.velocity_bandwidth,
-            "torque_limit": self.torque_limit,
-            "rotor_inertia": self.rotor_inertia,
-            "coulomb_friction": self.coulomb_friction,
-            "viscous_friction": self.viscous_friction,
-        }
-        for name, values in lists.items():
-            if len(values) not in {1, n}:
+        for name, values in vars(self).items():
+            if isinstance(values, tuple) and len(values) not in {1, n}:
                 raise ValueError(f"{name} must have 1 or {n} numbers, got {len(values)}")
 
 

@@ -190,14 +190,13 @@ def _subdivided(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
     """Return vertices (4 f, 3)/2 + 2 and triangles (4 f, 3) of a sphere whose f triangles are split in four."""
     followers = np.roll(triangles, -1, axis=1)
     edges = np.stack([triangles, followers], axis=-1).reshape(-1, 2)
-    edges = np.sort(edges, axis=1)
     # Two triangles share each edge, and its middle: one new vertex for each pair of ends.
-    keys = edges[:, 1] * len(vertices) + edges[:, 0]
-    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    descending = -np.sort(-edges, axis=1)
+    pairs, place = np.unique(descending, axis=0, return_inverse=True)
     a, b, c = triangles.T
     ab, bc, ca = len(vertices) + place.reshape(-1, 3).T
     split = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1)
-    middles = vertices[edges[first]].mean(axis=1)
+    middles = vertices[pairs].mean(axis=1)
     refined = np.concatenate([vertices, middles])
     length = np.sqrt(np.dot(refined**2, np.ones(3)))[:, None]
     on_sphere = refined + refined / length * (1.0 - length)
@@ -237,7 +236,7 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    tree = arm_tree(arm, robot)
+    tree = arm_tree(arm, robot, payload)
     for link in tree.iter("link"):
         for visual in link.findall("visual"):
             if not shapes:
@@ -249,9 +248,6 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
             for mesh in visual.findall("geometry/mesh"):
                 mesh.tag = "sphere"
                 mesh.attrib = {"radius": repr(robot.workspace.ball_radius)}
-        mass = link.find("inertial/mass")
-        if link.get("name") == BALL_LINK and mass is not None:
-            mass.set("value", repr(LIGHT_PART[0] + payload))
     return text(tree)
 
 
@@ -279,7 +275,7 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     return text(robot)
 
 
-def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
+def arm_tree(arm: SerialArm, described: Robot, payload: float = 0.0) -> ET.Element:
     """Return the URDF of an arm with masses and visual shapes of a robot; its joint angles are the true ones, θ.
 
     It has the base, a link a joint, the flange and the ball, which is drawn by the mesh `BALL_MESH`.
@@ -287,6 +283,7 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     Args:
         arm: the kinematics, mismatch included.
         described: by its maker's description, for masses and shapes.
+        payload: kg, a point load at the ball.
 
     Raises:
         ValueError: the arm has another number of joints than the robot.
@@ -327,7 +324,8 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, 0.0), arm.tool, 0.25 * ball_radius)
     tool = np.stack([arm.tool, np.zeros(3)])
     add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), tool, turns=False)
-    ball = add_link(robot, BALL_LINK, *LIGHT_PART)
+    ball_mass, ball_inertia = LIGHT_PART
+    ball = add_link(robot, BALL_LINK, ball_mass + payload, ball_inertia)
     draw_mesh(ball, RED, BALL_MESH, ball_radius)
     return robot
 

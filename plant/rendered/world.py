@@ -10,7 +10,7 @@ Delay, latency and lost frames are those of `servobench.plant.bench.bench`.
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,8 +77,7 @@ class Contacts:
         return None
 
 
-@dataclass(frozen=True, eq=False)
-class RenderedState:
+class RenderedState(NamedTuple):
     """A saved state of the world, without handles: any world with the same robot and settings can restore it."""
 
     joints: DriveState  # angles, speeds and loops of the joints

@@ -174,6 +174,17 @@ class SerialArm:
         return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
 
 
+def plain_arm(
+    joint_names: tuple[str, ...],
+    translation: FloatArray,
+    rpy: FloatArray,
+    tool: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> SerialArm:
+    """Return an arm with gear ratios of 1 and no joint offsets; the arguments are the fields of `SerialArm`."""
+    n = len(joint_names)
+    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.asarray(tool))
+
+
 def arm_from_dh(
     a: npt.ArrayLike,
     d: npt.ArrayLike,
@@ -217,14 +228,7 @@ def arm_from_dh(
         z = offset
     rpy = np.zeros((n + 1, 3))
     rpy[:, 0] = roll
-    return SerialArm(
-        joint_names=joint_names,
-        translation=np.stack([x, y, z], axis=-1),
-        rpy=rpy,
-        joint_offset=np.zeros(n),
-        gear_ratio=np.ones(n),
-        tool=np.zeros(3),
-    )
+    return plain_arm(joint_names, np.stack([x, y, z], axis=-1), rpy)
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,40 +31,15 @@ from servobench.plant.contract.settings import (
     settings,
 )
 from servobench.plant.robot.camera import PinholeCamera
-from servobench.plant.robot.camera_formats import LENSES, in_rows, plain_name, read_intrinsics
+from servobench.plant.robot.camera_formats import (
+    FACTS,
+    LENSES,
+    in_rows,
+    plain_name,
+    read_intrinsics,
+)
 
-# ROS's name of a model -> its names without capitals, blanks, hyphens and underscores
-LENS_NAMES: Final[Mapping[str, tuple[str, ...]]] = {
-    "plumb_bob": ("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"),
-    "rational_polynomial": ("rationalpolynomial", "rational", "rationalmodel", "fullopencv"),
-    "equidistant": (
-        "equidistant",
-        "equi",
-        "fisheye",
-        "opencvfisheye",
-        "kb",
-        "kb4",
-        "kb8",
-        "kannalabrandt",
-        "kannalabrandt4",
-        "kannalabrandt8",
-    ),
-    "": ("", "opencv"),
-    "none": (
-        "none",
-        "null",
-        "no",
-        "nodistortion",
-        "undistorted",
-        "rectified",
-        "ideal",
-        "pinhole",
-        "perspective",
-        "inversebrownconrady",
-        "modifiedbrownconrady",
-    ),
-}
-SYNONYMS: Final = {name: lens for lens, names in LENS_NAMES.items() for name in names}
+SYNONYMS: Final = {name: lens for lens, names in FACTS["lens_names"].items() for name in names}
 WANTED: Final = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
 RANGES: Final = {  # unit, least and largest number
     "width": ("px", 16, 20_000), "height": ("px", 16, 20_000), "vertical_fov": ("deg", 2, 170),
@@ -121,11 +96,9 @@ class Pose(Place):
         """Check the numbers."""
         super().__post_init__()
         if self.matrix[2, 2] < MIN_AHEAD and self.frame == "flange":
-            wanted = (
-                "z is the optical axis, x points right and y down, and a quaternion is x, y, z, w"
-            )
             remark(
-                f"pose.rotation turns the optical axis by more than 60° from the flange's z axis: {wanted}"
+                "pose.rotation turns the optical axis by more than 60° from the flange's z axis: z is the "
+                "optical axis, x points right and y down, and a quaternion is x, y, z, w"
             )
 
     @cached_property
@@ -133,31 +106,26 @@ class Pose(Place):
         """The pose in its frame, (4, 4)."""
         from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
-        given = np.zeros(0)
+        given: FloatArray = np.zeros(0)
         if len({np.size(row) for row in self.rotation}) == 1:
             given = np.array(self.rotation)
-        if _is_quaternion(given):
+        # Numbers may be rounded.
+        if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
             rotation = Rotation.from_quat(given)
-        elif _is_rotation_matrix(given):
+        elif given.shape == (3, 3) and _is_rotation_matrix(given):
             rotation = Rotation.from_matrix(given)
         else:
-            wanted = "a rotation matrix or a quaternion of length 1"
-            raise ValueError(f"pose.rotation must be {wanted}, got {self.rotation}")
+            raise ValueError(
+                f"pose.rotation must be a rotation matrix or a quaternion of length 1, got {self.rotation}"
+            )
         pose = np.eye(4)
         pose[:3, :3] = rotation.as_matrix()
         pose[:3, 3] = self.position or 0.0
         return pose
 
 
-def _is_quaternion(given: FloatArray) -> bool:
-    """Return whether an array is a quaternion of length 1, whose numbers may be rounded."""
-    return given.shape == (4,) and bool(abs(np.linalg.norm(given) - 1.0) < ROUNDED)
-
-
 def _is_rotation_matrix(given: FloatArray) -> bool:
-    """Return whether an array is a rotation matrix, whose numbers may be rounded."""
-    if given.shape != (3, 3):
-        return False
+    """Return whether a matrix (3, 3) is a rotation, whose numbers may be rounded."""
     deviation = np.abs(given @ given.T - np.eye(3)).max()
     return bool(deviation < ROUNDED < np.linalg.det(given))
 
@@ -311,7 +279,9 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
         matrix = _matrix(keys)
         lens, distortion = _lens(keys)
         camera = OwnCamera(tuple(files), keys, matrix, lens, distortion, other)
-        _check(camera)
+        _check_distortion(camera)
+        if other is not None:
+            _check_second(camera, other)
     return camera
 
 
@@ -344,9 +314,9 @@ def _matrix(keys: CameraFile) -> FloatArray:
     min_focal, max_focal = FOCAL
     for focal in (float(K[0, 0]), float(K[1, 1])):
         if not min_focal * width <= focal <= max_focal * width:
-            wanted = "in px it is the focal length in mm over the side of a pixel in mm"
             raise ValueError(
-                f"matrix: a focal length of {focal:g} px does not fit a width of {width} px; {wanted}"
+                f"matrix: a focal length of {focal:g} px does not fit a width of {width} px; in px it is the "
+                "focal length in mm over the side of a pixel in mm"
             )
     size = (width, height)
     principal_point = K[:2, 2]
@@ -418,7 +388,7 @@ def _least_lens(lens: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[
     return lens, coefficients
 
 
-def stretch(coefficients: Sequence[float], s: FloatArray) -> FloatArray:
+def stretch(coefficients: Sequence[float], s: FloatArray) -> npt.NDArray[np.floating]:
     """Return the factor by which a lens without tangential distortion moves points away from the middle.
 
     Args:
@@ -427,13 +397,13 @@ def stretch(coefficients: Sequence[float], s: FloatArray) -> FloatArray:
     """
     if len(coefficients) == len(LENSES["equidistant"]):
         k1, k2, k3, k4 = coefficients
-        return 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
+        return np.polyval([k4, k3, k2, k1, 1.0], s)
     k1, k2, _, _, k3, *others = coefficients
-    above = 1.0 + s * (k1 + s * (k2 + s * k3))
+    above = np.polyval([k3, k2, k1, 1.0], s)
     if not others:
         return above
     k4, k5, k6 = others
-    return np.asarray(above / (1.0 + s * (k4 + s * (k5 + s * k6))))
+    return above / np.polyval([k6, k5, k4, 1.0], s)
 
 
 def turning_point(coefficients: Sequence[float]) -> float:
@@ -465,13 +435,6 @@ def _least_root(polynomial: npt.ArrayLike) -> float:
     is_real = np.abs(roots.imag) < 1e-9 * np.abs(roots)
     positive = roots.real[is_real & (roots.real > 0.0)]
     return float(min(positive, default=ENDLESS))
-
-
-def _check(camera: OwnCamera) -> None:
-    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together."""
-    _check_distortion(camera)
-    if camera.second is not None:
-        _check_second(camera, camera.second)
 
 
 def _check_distortion(camera: OwnCamera) -> None:

@@ -12,34 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from servobench.plant.contract.facts import read_facts
 from servobench.plant.contract.files import read_text
 from servobench.plant.contract.settings import remark
 
-NAMES: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names
-    "width": ("image_width", "width", "w"),
-    "height": ("image_height", "height", "h"),
-    "matrix": ("camera_matrix", "cameraMatrix", "CameraMat", "k", "K"),
-    "distortion": (
-        "distortion_coefficients", "distCoeffs", "dist_coeffs", "DistCoeff", "distortion_coeffs", "d", "D",
-    ),
-    "distortion_model": ("distortion_model", "DistModel"),
-}  # fmt: skip
-SIZES: Final = ("ImageSize", "image_size", "resolution")  # width and height
-PROJECTIONS: Final = ("camera_model", "model_type", "Camera.type")
-# Projections with any distortion
-PINHOLES: Final = ("pinhole", "pinholefull", "perspective", "opencv")
-FOCAL_NAMES: Final = (
-    ("fx", "fy", "cx", "cy"),
-    ("fl_x", "fl_y", "cx", "cy"),
-    ("mu", "mv", "u0", "v0"),
-)
-# ROS's name of a model -> coefficients of OpenCV, in its order
-LENSES: Final[Mapping[str, tuple[str, ...]]] = {
-    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
-    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "equidistant": ("k1", "k2", "k3", "k4"),
-}
-FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
+FACTS: Final = read_facts("cameras")
+NAMES: Final = FACTS["names"]
+LENSES: Final = FACTS["lenses"]
 PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
 # Parts of names, or whole names, of keys that may hold a distortion
 DISTORTION: Final = re.compile(
@@ -66,7 +45,7 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     found = _flat(_first_camera(path, found))
     keys = _known_keys(path, found)
     _check_part(path, found, keys)
-    projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
+    projection = next((str(found[name]) for name in FACTS["projections"] if name in found), "")
     if projection and "matrix" not in keys:
         raise ValueError(
             f"{path.name} is of the projection {projection!r}, which is not known or lacks its numbers"
@@ -80,7 +59,7 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     if "distortion_model" in keys:
         # An empty one stands for none in ROS.
         keys["distortion_model"] = keys["distortion_model"] or "none"
-    if projection and plain_name(projection) not in PINHOLES:
+    if projection and plain_name(projection) not in FACTS["pinholes"]:
         keys["distortion_model"] = projection
     if found.get("fisheye_model"):
         keys["distortion_model"] = "fisheye"
@@ -158,11 +137,11 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
             keys.setdefault(name.partition(".")[2], value)
         if name in PARTS and isinstance(value, dict):
             keys |= value
-    size = next((keys[name] for name in SIZES if name in keys), None)
+    size = next((keys[name] for name in FACTS["sizes"] if name in keys), None)
     if isinstance(size, list) and len(size) == 2:
         keys["image_width"], keys["image_height"] = size
     numbers = keys.get("intrinsics")
-    for names in FOCAL_NAMES:
+    for names in FACTS["focal_names"]:
         if all(name in keys for name in names):
             numbers = [keys[name] for name in names]
     if isinstance(numbers, list) and len(numbers) == 4:
@@ -170,7 +149,7 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
         keys.setdefault("camera_matrix", [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
     given = {name: keys[name] for name in LENSES["rational_polynomial"] if name in keys}
     if "mu" in keys:
-        names_in_vins = zip(LENSES["equidistant"], FISHEYE_OF_VINS, strict=True)
+        names_in_vins = zip(LENSES["equidistant"], FACTS["fisheye_of_vins"], strict=True)
         given = {name: keys.get(other, 0.0) for name, other in names_in_vins}
     if given and not any(name in keys for name in NAMES["distortion"]):
         keys["distortion_coefficients"] = given
@@ -219,5 +198,7 @@ def _check_part(path: Path, found: Mapping[str, Any], keys: Mapping[str, Any]) -
         (roi.get("height"), keys.get("height")),
     )
     if any(given not in (None, 0, whole) for given, whole in given_and_whole):
-        part = "binning or a region (roi) leaves a part; write size and matrix of the image as it comes into a TOML"
-        raise ValueError(f"{path.name} is of a larger image, of which {part}")
+        raise ValueError(
+            f"{path.name} is of a larger image, of which binning or a region (roi) leaves a part; write size and "
+            "matrix of the image as it comes into a TOML"
+        )

@@ -29,9 +29,9 @@ from servobench.plant.robot.ur5 import UR5
 from servobench.plant.robot.urdf_elements import RUN_XACRO
 from servobench.plant.robot.workspace import search_workspace, with_ball
 
-ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
-    title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
-} | {"panda": panda}
+ROBOTS: Final = {title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS} | {
+    "panda": panda
+}
 """The arms by their makers' tables; each is made once."""
 DEFAULT_ROBOT: Final = UR5
 WITH: Final = " with "  # between a robot and the file of its camera
@@ -71,9 +71,11 @@ def find_robot(text: str) -> Robot:
     if PurePath(before_link).suffix.lower() == ".xacro":
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
-        kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"
         known = suggest(text, ROBOTS)
-        wanted = f"{known}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
+        wanted = (
+            f"{known}; or a file: a factory calibration (.yaml), a DH table (.toml) or a .urdf; or an arm that is "
+            f"drawn, {RANDOM_ARM}:7"
+        )
         raise ValueError(f"unknown robot {text!r}: {wanted}")
     return _read(text, _changed("robot", path))
 

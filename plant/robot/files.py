@@ -129,8 +129,7 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
         name = table.name or path.stem
         note = ""
         if not table.mass:
-            quantities = "masses, inertia and torque limits"
-            note = f"{name}: {quantities} are estimated from the lengths of the links"
+            note = f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
         return Robot(name, name, path.name, arm, limits, links, workspace, note=note)
 
 

@@ -18,18 +18,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, plain_arm
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
-from servobench.plant.robot.workspace import (
-    CENTRE,
-    Workspace,
-    find_workspace,
-    length_scale,
-    with_ball,
-)
+from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
 
 Triple = tuple[float, float, float]
 CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -82,11 +76,13 @@ def universal_robot(title: str) -> Robot:
         np.radians(np.repeat(row.speed, ALIKE)),
     )
     if title == "UR5":
-        return _ur5(row, limits)
+        links = Links(**ur5.LINKS, payload=row.payload)
+        workspace = Workspace(**ur5.WORKSPACE)
+        return Robot("ur5", title, UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
     arm = with_ball(row.arm())
     scale = length_scale(arm)
-    radius = scale * np.array(ur5.TUBE_RADIUS)
-    aside = scale * np.array(ur5.SIDE_STEP)
+    radius = scale * np.array(ur5.LINKS["radius"])
+    aside = scale * np.array(ur5.LINKS["aside"])
     mass = np.array(row.mass)
     links = Links(
         mass,
@@ -99,30 +95,6 @@ def universal_robot(title: str) -> Robot:
     )
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
-
-
-def _ur5(row: UniversalRobot, limits: JointLimits) -> Robot:
-    """Return the UR5, with the workspace of its sheet."""
-    links = Links(
-        ur5.MASS,
-        ur5.CENTRE_OF_MASS,
-        ur5.INERTIA,
-        ur5.MAX_TORQUE,
-        ur5.TUBE_RADIUS,
-        ur5.SIDE_STEP,
-        row.payload,
-    )
-    workspace = Workspace(
-        1.0,
-        np.array(CENTRE),
-        ur5.SHOULDER,
-        ur5.HOME,
-        ur5.TRAINING_LOWER,
-        ur5.TRAINING_UPPER,
-        ur5.MOVES,
-        ur5.STRETCHED,
-    )
-    return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
 
 
 @cache
@@ -224,21 +196,15 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
         TypeError,
         ValueError,
     ) as error:
-        came = "holds something that is not a number where one is wanted"
-        raise ValueError(f"calibration file {path} {came}: 'kinematics' has {wanted}") from error
+        raise ValueError(
+            f"calibration file {path} holds something that is not a number where one is wanted: 'kinematics' has "
+            f"{wanted}"
+        ) from error
     if not np.isfinite(table).all():
         raise ValueError(f"calibration file {path} holds a number that is not finite")
-    n = len(table)
     # The flange is where the last joint is.
     rows = np.vstack([table, np.zeros(6)])
-    return SerialArm(
-        joint_names=ur5.JOINT_NAMES,
-        translation=rows[:, :3],
-        rpy=rows[:, 3:],
-        joint_offset=np.zeros(n),
-        gear_ratio=np.ones(n),
-        tool=as_array("tool", tool, (3,)),
-    )
+    return plain_arm(ur5.JOINT_NAMES, rows[:, :3], rows[:, 3:], tool)
 
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:
@@ -261,8 +227,10 @@ def known_title(arm: SerialArm, file: object) -> tuple[str, float]:
     if apart <= MAX_DEVIATION:
         named = zip(LENGTHS, lengths.tolist(), strict=True)
         sizes = ", ".join(f"{name} = {length:.4f}" for name, length in named)
-        looks = "looks like an arm of Universal Robots that is not in the catalogue"
-        found = f"calibration file {file} {looks}: bring its URDF, or a DH table with {sizes} m"
+        found = (
+            f"calibration file {file} looks like an arm of Universal Robots that is not in the catalogue: bring "
+            f"its URDF, or a DH table with {sizes} m"
+        )
     raise ValueError(
         f"{found}; the {title} comes nearest, and its flange is {1e3 * deviation:.0f} mm away"
     )

@@ -393,14 +393,14 @@ def _profile(
     return {"links": share, **angles, "tool": tool, **cameras}
 
 
-PROFILES: Final[dict[str, dict[str, float]]] = {
+PROFILES: Final = {
     "none": {},
     "factory": {},
     "moderate": _profile(0.05, 3.0, 15.0, 0.02, 5.0),
     "severe": _profile(0.1, 6.0, 45.0, 0.04, 10.0),
     "lab": _profile(0.008, 0.1, 8.0, 0.01, 2.0) | {"mount": radians(8.0)},
 }
-PROFILE_SETTINGS: Final[dict[str, dict[str, float]]] = {
+PROFILE_SETTINGS: Final = {
     "lab": {
         "command_delay": 0.005,
         "lag": 0.03,

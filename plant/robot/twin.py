@@ -149,8 +149,10 @@ class Twin:
                 f"twin {self.path} was logged with the sensing {self.keys.sensing}, got {sensing}"
             )
         if not exact:
-            words = "leave the mismatch out, and axes, but for camera_move and those of sensor, gears and tool"
-            raise ValueError(f"twin {self.path} draws its robot from a posterior: {words}")
+            raise ValueError(
+                f"twin {self.path} draws its robot from a posterior: leave the mismatch out, and axes, but for "
+                "camera_move and those of sensor, gears and tool"
+            )
         planned = nominal.with_camera(self.keys.camera.pose.matrix)
         return deviated(planned, self.values(seed))
 

@@ -210,16 +210,11 @@ def _tool(tree: Tree, ways: Ways) -> dict[str, str]:
             continue
         if followers[joint.name]:
             tool[joint.name] = f"mimicked by {followers[joint.name]}"
-        elif _is_gripper_by_name(joint):
+        elif WRIST.search(joint.name):  # It may turn a whole gripper.
+            continue
+        elif GRIPPER.search(joint.name) or FINGER.search(joint.child):
             tool[joint.name] = "by its name"
     return tool
-
-
-def _is_gripper_by_name(joint: JointElement) -> bool:
-    """Return whether the names of a joint and its link are those of a gripper, and not of a wrist that turns one."""
-    if WRIST.search(joint.name):
-        return False
-    return bool(GRIPPER.search(joint.name) or FINGER.search(joint.child))
 
 
 def _fingers(tree: Tree, ways: Ways) -> dict[str, str]:
@@ -284,7 +279,12 @@ def _ending(tree: Tree, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) 
             )
     lines = []
     if following:
-        why = [f"{joint.name} ({_reason(joint, tool)})" for joint in following]
+        why = []
+        for joint in following:
+            reason = tool.get(joint.name, joint.type)
+            if joint.mimic is not None:
+                reason = f"mimics {joint.mimic.joint}"
+            why.append(f"{joint.name} ({reason})")
         taken = ""
         rotating = [joint for joint in following if joint.name in tool]
         if rotating:
@@ -298,13 +298,6 @@ def _ending(tree: Tree, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) 
     if others:
         lines.append(f"as many joints lead to {listed(others, 3)}")
     return "; ".join(lines)
-
-
-def _reason(joint: JointElement, tool: dict[str, str]) -> str:
-    """Return why a joint after the last one of a chain is of the tool."""
-    if joint.mimic is not None:
-        return f"mimics {joint.mimic.joint}"
-    return tool.get(joint.name, str(joint.type))
 
 
 def _is_axis(joint: JointElement) -> bool:

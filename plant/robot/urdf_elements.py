@@ -11,13 +11,14 @@ of `rpy`, 1.2 adds three limits that do not concern geometry.
 import difflib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from io import BytesIO
 from math import hypot, isfinite
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 from xml.etree import ElementTree as ET
 
+from servobench.plant.contract.facts import read_facts
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import accessing
 from servobench.plant.contract.settings import listed, remark, suggest
@@ -31,68 +32,19 @@ RUN_XACRO: Final = "run xacro first, and give what it prints: `xacro FILE > arm.
 READ_QUATERNION: Final = (
     'quat_xyzw of <origin>, which is read; ROS reads it in <robot version="1.1"> only'
 )
-# Element -> its attributes -> count of numbers, 0 for a text
-ATTRIBUTES: Final[Mapping[str, Mapping[str, int]]] = {
-    "link": {"name": 0, "type": 0},
-    "inertial": {},
-    "mass": {"value": 1},
-    "inertia": {"ixx": 1, "ixy": 1, "ixz": 1, "iyy": 1, "iyz": 1, "izz": 1},
-    "joint": {"name": 0, "type": 0},
-    "parent": {"link": 0},
-    "child": {"link": 0},
-    "origin": {"xyz": 3, "rpy": 3, "quat_xyzw": 4},
-    "axis": {"xyz": 3},
-    "limit": {
-        "lower": 1,
-        "upper": 1,
-        "effort": 1,
-        "velocity": 1,
-        "acceleration": 1,
-        "deceleration": 1,
-        "jerk": 1,
-    },
-    "mimic": {"joint": 0, "multiplier": 1, "offset": 1},
-    "safety_controller": {
-        "soft_lower_limit": 1,
-        "soft_upper_limit": 1,
-        "k_position": 1,
-        "k_velocity": 1,
-    },
-}
-# Element -> known elements in it
-CHILDREN: Final[Mapping[str, tuple[str, ...]]] = {
-    "link": ("inertial", "visual", "collision", "contact"),
-    "inertial": ("origin", "mass", "inertia"),
-    "joint": (
-        "parent",
-        "child",
-        "origin",
-        "axis",
-        "limit",
-        "mimic",
-        "safety_controller",
-        "dynamics",
-        "calibration",
-    ),
-}
+URDF: Final = read_facts("urdf")
+ATTRIBUTES: Final = URDF["attributes"]
+CHILDREN: Final = URDF["children"]
+SIMILAR: Final = URDF["similar"]
+REQUIRED: Final = URDF["required"]
+OF_OTHERS: Final = URDF["of_others"]
+OF_XACRO: Final = URDF["of_xacro"]
 ENDS: Final = ("parent", "child")
 # Elements of a joint whose values are geometry
 GEOMETRY: Final = ("origin", "axis", "limit", "mimic")
-# Element -> likely meanings of an unknown element in it
-SIMILAR: Final[Mapping[str, tuple[str, ...]]] = {
-    "robot": ("link", "joint"),
-    "link": ("link", "joint"),
-    "inertial": ("origin",),
-    "joint": (*GEOMETRY, *ENDS, "link", "joint", "lower", "upper", "xyz", "rpy"),
-}
-REQUIRED: Final = {"parent": "link", "child": "link", "mimic": "joint", "axis": "xyz"}
 LIMITING: Final = ("limit", "safety_controller")  # elements whose numbers may be infinite
 TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 MOMENTS: Final = {"ixx", "iyy", "izz"}
-# Parts of a robot for other programs
-OF_OTHERS: Final = ("material", "gazebo", "transmission", "ros2_control", "sensor")
-# Elements without a prefix
-OF_XACRO: Final = ("property", "macro", "include", "insert_block", "if", "unless", "arg")
 EXPRESSION: Final = re.compile(r"\$[{(].*?[})]")  # xacro would replace it
 # In names of limits without geometry
 DYNAMIC: Final = re.compile(r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff")
@@ -221,8 +173,10 @@ def _copy_robot(root: Element, passed: dict[str, None]) -> ET.Element:
         elif tag in OF_OTHERS or ":" in tag:
             continue
         elif hidden or _is_like(tag, SIMILAR["robot"]):
-            wanted = "links and joints are <link> and <joint> directly in <robot>"
-            raise ValueError(f"<{tag}> in line {part.sourceline} is no element of a URDF; {wanted}")
+            raise ValueError(
+                f"<{tag}> in line {part.sourceline} is no element of a URDF; links and joints are <link> and "
+                "<joint> directly in <robot>"
+            )
         else:
             passed[f"<{tag}>"] = None
     for name, count in Counter(names).items():
@@ -312,16 +266,10 @@ def _element_matters(parent: str, part: Element) -> bool:
         return parent in GEOMETRY + ENDS
     if _is_like(tag, SIMILAR[parent]):
         return True
-    return parent == "joint" and _holds_vector(part)
-
-
-def _holds_vector(part: Element) -> bool:
-    """Return whether an attribute or a text of an element, or of one in it, is a vector."""
+    texts = list[str]()
     for element in part.iter():
-        texts = (*element.attrib.values(), element.text or "")
-        if any(map(_is_vector, texts)):
-            return True
-    return False
+        texts += (*element.attrib.values(), element.text or "")
+    return parent == "joint" and any(map(_is_vector, texts))
 
 
 def _is_like(word: str, words: Iterable[str]) -> bool:
@@ -346,18 +294,13 @@ def _check_numbers(what: str, text: str, count: int, *, infinite: bool) -> None:
         return
     words = text.split()
     for word in words:
-        if not _is_number(word, infinite=infinite):
+        # A limit may be infinite by its size or by its name.
+        is_number = NUMBER.fullmatch(word) or INFINITE.fullmatch(word)
+        if not is_number or not (infinite or isfinite(float(word))):
             remedy = next((f"; {remedy}" for fault, remedy in REMEDIES if fault.search(word)), "")
             raise ValueError(f"{what} has {word!r}, which is no number{remedy}")
     if len(words) != count:
         raise ValueError(f"{what}: the count of numbers must be {count}, got {text!r}")
-
-
-def _is_number(word: str, *, infinite: bool) -> bool:
-    """Return whether a word is a number; one that may be infinite can be so by its size or by its name."""
-    if infinite:
-        return bool(NUMBER.fullmatch(word) or INFINITE.fullmatch(word))
-    return bool(NUMBER.fullmatch(word)) and isfinite(float(word))
 
 
 def _turn_by_quaternion(origin: ET.Element, place: str) -> None:

@@ -11,7 +11,7 @@ from annotated_types import Ge, Le
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import Check, Number, Positive, read_value, remark
-from servobench.plant.robot.arm import JointLimits, SerialArm, rpy_from_rotation
+from servobench.plant.robot.arm import JointLimits, SerialArm, plain_arm, rpy_from_rotation
 from servobench.plant.robot.files import Mass
 from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
 from servobench.plant.robot.urdf_chain import Chain, Joint, JointElement, find_chain, pose_of
@@ -77,17 +77,9 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
 def _arm(chain: Chain) -> SerialArm:
     """Return the kinematics of a chain, with a ball."""
     names = tuple(link.joint.name for link in chain.joints)
-    n = len(names)
     origins = np.stack([*(link.origin for link in chain.joints), chain.flange])
-    arm = SerialArm(
-        joint_names=names,
-        translation=origins[:, :3, 3],
-        rpy=rpy_from_rotation(origins[:, :3, :3]),
-        joint_offset=np.zeros(n),
-        gear_ratio=np.ones(n),
-        tool=np.zeros(3),
-    )
-    return with_ball(arm)
+    rpy = rpy_from_rotation(origins[:, :3, :3])
+    return with_ball(plain_arm(names, origins[:, :3, 3], rpy))
 
 
 def _limits(joints: list[JointElement]) -> JointLimits:

@@ -170,8 +170,12 @@ class Clearance:
         frames = self.arm.frames(q[fits])
         ball = self.arm.ball(frames)
         tubes = self.tubes.placed(frames)
-        ball_is_high = ball[:, 2] >= MIN_BALL_HEIGHT * self.scale
-        good = ball_is_high & self._above_table(tubes)
+        # All links but the first two stand above the table.
+        high = self.tubes.link >= 1
+        heights = tubes[:, high][..., 2].min(axis=-1)
+        gaps = heights - self.tubes.radius[high]
+        links_are_high = (gaps >= MIN_LINK_HEIGHT * self.scale).all(axis=-1)
+        good = links_are_high & (ball[:, 2] >= MIN_BALL_HEIGHT * self.scale)
         # Each of the dearer criteria is asked only of the postures that are good by then.
         good[good] = self._in_view(ball[good], tubes[good])
         gaps = self.gaps(tubes[good], self.pairs)
@@ -194,13 +198,6 @@ class Clearance:
         second = placed[..., pairs[:, 1], :, :]
         radii = self.tubes.radius[pairs].sum(axis=-1)
         return np.asarray(segment_distance(first, second) - radii)
-
-    def _above_table(self, placed: FloatArray) -> BoolArray:
-        """Return whether all links but the first two, which stand on the table, are above it."""
-        chosen = self.tubes.link >= 1
-        heights = placed[..., 2][..., chosen, :]
-        lowest = heights.min(axis=-1) - self.tubes.radius[chosen]
-        return np.asarray((lowest >= MIN_LINK_HEIGHT * self.scale).all(axis=-1))
 
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
@@ -322,8 +319,10 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
         size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
         raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
     look = _likely_cause(arm, limits, shapes)
-    wanted = "in which its ball is over the table, in view of the camera and free of contact"
-    raise ValueError(f"the arm has no posture {wanted}; look at {look}")
+    raise ValueError(
+        "the arm has no posture in which its ball is over the table, in view of the camera and free of contact; "
+        f"look at {look}"
+    )
 
 
 def _likely_cause(arm: SerialArm, limits: Pair, shapes: Pair) -> str:
@@ -354,18 +353,16 @@ def search_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace | 
     """
     if arm.n < 3 or length_scale(arm) <= 0.0:
         return None
-    best: Found | None = None
+    found = []
     for height in HEIGHTS:
-        found = _at_height(arm, limits, shapes, height)
-        if found is None:
-            continue
-        if best is None or found.score > best.score:
-            best = found
-        if found.score >= GOOD_BOX:
-            break
-    if best is None:
+        at_height = _at_height(arm, limits, shapes, height)
+        if at_height is not None:
+            found.append(at_height)
+            if at_height.score >= GOOD_BOX:
+                break
+    if not found:
         return None
-    return best.make()
+    return max(found, key=lambda each: each.score).make()
 
 
 class Found(NamedTuple):

@@ -73,7 +73,7 @@ def test_the_simulators_ball_joints_and_flange_are_where_the_arm_says(arm, loade
 
 def test_the_centres_of_mass_are_those_of_the_data_sheet_in_the_dh_frames(arm, loaded):
     q = np.random.default_rng(2).uniform(-np.pi, np.pi, 6)
-    for link, (frame, centre) in enumerate(zip(arm.frames(q), ur5.CENTRE_OF_MASS, strict=False)):
+    for link, (frame, centre) in enumerate(zip(arm.frames(q), ur5.LINKS["centre"], strict=False)):
         in_joint = rotation_from_rpy(arm.rpy[link + 1]) @ centre + arm.translation[link + 1]
         np.testing.assert_allclose(
             loaded(q, link)[0], frame[:3, :3] @ in_joint + frame[:3, 3], atol=1e-6
@@ -83,8 +83,8 @@ def test_the_centres_of_mass_are_those_of_the_data_sheet_in_the_dh_frames(arm, l
 def test_masses_and_inertias_arrive_in_the_simulator(loaded):
     for link in range(6):
         info = loaded.dynamics(link)
-        assert info[0] == pytest.approx(ur5.MASS[link])
-        across, along = ur5.INERTIA[link]
+        assert info[0] == pytest.approx(ur5.LINKS["mass"][link])
+        across, along = ur5.LINKS["inertia"][link]
         np.testing.assert_allclose(sorted(info[2]), sorted([across, across, along]), rtol=1e-6)
 
 

@@ -1,0 +1,15 @@
+"""Facts that the package keeps as TOML files: arms, elements of URDF, and names of calibration tools."""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.settings import with_tuples
+
+DATA: Final = Path(str(files("servobench.plant") / "data"))
+
+
+def read_facts(name: str) -> Any:  # noqa: ANN401 - as the file has them
+    """Return the content of the file of a name among the package's data, with tuples for lists."""
+    return with_tuples(read_toml("facts", DATA / f"{name}.toml"))
