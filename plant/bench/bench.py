@@ -143,8 +143,10 @@ def rounded_to(
     far = [name for name in odd if not _is_multiple(times[name], step, NEGLIGIBLE)]
     if far:
         named = ", ".join(far).replace("frame_period", "exposures")
-        part = f"1/{round(period / step)} of the control period of {period:.6g} s"
-        remark(f"{named}: rounded to multiples of {1e3 * step:.6g} ms, {part}")
+        remark(
+            f"{named}: rounded to multiples of {1e3 * step:.6g} ms, 1/{round(period / step)} of the control "
+            f"period of {period:.6g} s"
+        )
     for name in odd:
         if name not in far or name != "frame_period":
             times[name] = round(times[name] / step) * step
@@ -542,9 +544,9 @@ def build_bench(
     except ValueError as error:
         if step == setup.period:
             raise
-        found = f"in sub-steps of {step:g} s, which the delays and the period need: {error}"
         raise ValueError(
-            f"{found}; run.period, command_delay and latency that are multiples of its own step help"
+            f"in sub-steps of {step:g} s, which the delays and the period need: {error}; run.period, "
+            "command_delay and latency that are multiples of its own step help"
         ) from error
     command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
     camera = None if setup.model is None else setup.model.camera

@@ -108,8 +108,10 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
         ValueError: the arm has too few joints for the set-up.
     """
     if robot.n < setup.least_joints:
-        wanted = f"an arm of {setup.least_joints} joints or more"
-        raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
+        raise ValueError(
+            f"sensing {setup.name} needs an arm of {setup.least_joints} joints or more, and {robot.title} has "
+            f"{robot.n}"
+        )
     if robot.camera is not None:
         _check_fit(robot.camera, setup, mount)
     cameras = planned_cameras(setup, mount, robot)

@@ -205,8 +205,10 @@ class SensingSetup:
         self, name: str, made: object, shape: tuple[int, ...], points: FloatArray
     ) -> None:
         """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
-        wanted = f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :]"
-        expected = f"sensing {self.name}: {name} must return {wanted}"
+        expected = (
+            f"sensing {self.name}: {name} must return float64 or float32 of shape {shape} for points "
+            f"{points.shape}, as points[..., 0, 0, :]"
+        )
         if type(made) is not np.ndarray:
             raise ConfigurationError(f"{expected}, got {type(made).__name__}")
         if made.shape != shape or made.dtype not in FLOAT_TYPES:

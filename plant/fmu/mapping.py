@@ -381,8 +381,10 @@ def first_instant(given: float | None, description: FmuDescription, step: float)
         source = "start_time of the mapping"
     error = abs(time + step - time - step)
     if not error <= MAX_STEP_ERROR * step:
-        found = f"{file} cannot take steps of {step:g} s from {time:g} s, the {source}"
-        raise ValueError(f"{found}: write start_time = 0.0 into the mapping")
+        raise ValueError(
+            f"{file} cannot take steps of {step:g} s from {time:g} s, the {source}: write start_time = 0.0 into "
+            "the mapping"
+        )
     if time and given is None:
         remark(f"{file} begins at {time:g} s, the {source}; start_time in the mapping changes that")
     return time

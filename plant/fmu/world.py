@@ -299,10 +299,10 @@ class FmuWorld(World):
                     f"{self._result.labels[i]} (to {rows[first + 1][i]:.3g} in step {first + 1})"
                 )
         if jumps:
-            found = f"{self.description.path.name} returns 0 at the start for what then jumps though the arm rests"
             remark(
-                f"{found}: {', '.join(jumps)}; runs begin with a wrong measurement: let it compute its outputs in "
-                "the initialisation, too, or map `seen`"
+                f"{self.description.path.name} returns 0 at the start for what then jumps though the arm "
+                f"rests: {', '.join(jumps)}; runs begin with a wrong measurement: let it compute its outputs "
+                "in the initialisation, too, or map `seen`"
             )
 
     def move_camera(self, X_BC: FloatArray) -> None:

@@ -94,10 +94,9 @@ class Room:
             normal = np.cross(points[1] - points[0], points[2] - points[0])
         length = np.linalg.norm(normal)
         if len(points) > len(MARK_COLOURS) or not length > 1e-9:
-            came = f"sensing {model.setup.name} has a target of {len(points)} points"
             raise ValueError(
-                f"{came}; only these can be drawn: a ball, of one point, or a plate with three or four discs that "
-                "are not in line"
+                f"sensing {model.setup.name} has a target of {len(points)} points; only these can be drawn: a "
+                "ball, of one point, or a plate with three or four discs that are not in line"
             )
         scale = target_scale(model, self.robot)
         # One layer away from the side of the discs: first discs, then pads, then the rods from the middle.

@@ -243,8 +243,10 @@ class JointLimits:
         """Check order and signs and freeze the arrays."""
         freeze_arrays(self, (len(self.lower),), "lower", "upper", "speed")
         if not (self.lower < self.upper).all():
-            came = f"{self.lower.tolist()} and {self.upper.tolist()}"
-            raise ValueError(f"joint_lower must be below joint_upper for every joint, got {came}")
+            raise ValueError(
+                f"joint_lower must be below joint_upper for every joint, got {self.lower.tolist()} and "
+                f"{self.upper.tolist()}"
+            )
         if not (self.speed > 0.0).all():
             raise ValueError(f"joint_velocity_limit must be positive, got {self.speed.tolist()}")
 

@@ -238,8 +238,10 @@ def frame_time(what: str, rate: float, period: float) -> float:
         off = abs(round(in_milliseconds / period) * period - in_milliseconds)
         if off <= ROUNDED * period:
             return in_milliseconds
-    clocks = f"a frame takes {1e3 / rate:g} ms and a control period {1e3 * period:g} ms"
-    remark(f"{what}: {clocks}, so delays change; run.period={rate:.9g}Hz helps")
+    remark(
+        f"{what}: a frame takes {1e3 / rate:g} ms and a control period {1e3 * period:g} ms, so delays change; "
+        f"run.period={rate:.9g}Hz helps"
+    )
     return 1.0 / rate
 
 
@@ -324,8 +326,10 @@ def _matrix(keys: CameraFile) -> FloatArray:
     if not ((principal_point > 0.0) & (principal_point < size)).all():
         raise ValueError(f"matrix: the principal point {came} px must be in the image")
     if (np.abs(principal_point / size - 0.5) > MAX_OFF).any():
-        where = f"the principal point {came} px is far from the middle of {width} × {height} px"
-        remark(f"matrix: {where}; are cx and cy, or width and height, exchanged?")
+        remark(
+            f"matrix: the principal point {came} px is far from the middle of {width} × {height} px; are cx and "
+            "cy, or width and height, exchanged?"
+        )
     return K
 
 
@@ -341,8 +345,10 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
             f"distortion_model {keys.distortion_model!r} is not known; wanted {WANTED}, or none"
         )
     if lens == "none" and any(values):
-        named = f"distortion_model {keys.distortion_model!r}"
-        raise ValueError(f"{named} must have no coefficients but 0, got {given}; wanted {WANTED}")
+        raise ValueError(
+            f"distortion_model {keys.distortion_model!r} must have no coefficients but 0, got {given}; wanted "
+            f"{WANTED}"
+        )
     if lens in ("none", "plumb_bob", "rational_polynomial") and not any(values):
         return "plumb_bob", (0.0, 0.0, 0.0, 0.0, 0.0)
     if isinstance(given, dict):
@@ -459,15 +465,17 @@ def _check_distortion(camera: OwnCamera) -> None:
         last = math.atan(math.sqrt(last)) ** 2
     reach = math.sqrt(last) * float(stretch(D, np.array(last)))
     if reach < edge and not (fisheye and turn >= ENDLESS):
-        image = f"an image of {keys.width} × {keys.height} px before its corners, with this matrix"
-        raise ValueError(f"distortion {list(D)} folds {image}; take them from one calibration")
+        raise ValueError(
+            f"distortion {list(D)} folds an image of {keys.width} × {keys.height} px before its corners, with "
+            "this matrix; take them from one calibration"
+        )
     squares = np.linspace(0.0, min(edge**2, last))
     radial = np.abs(stretch(D, squares) - 1.0)
     moved = (radial + tangential * np.sqrt(squares)).max()
     if moved > MAX_MOVED:
-        much = f"moves points by {moved:.0%} of their distance from the middle; coefficients"
         remark(
-            f"distortion {list(D)} {much} of OpenCV are no percent, and {', '.join(LENSES[camera.lens])}"
+            f"distortion {list(D)} moves points by {moved:.0%} of their distance from the middle; "
+            f"coefficients of OpenCV are no percent, and {', '.join(LENSES[camera.lens])}"
         )
 
 

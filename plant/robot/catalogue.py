@@ -72,11 +72,10 @@ def find_robot(text: str) -> Robot:
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
         known = suggest(text, ROBOTS)
-        wanted = (
-            f"{known}; or a file: a factory calibration (.yaml), a DH table (.toml) or a .urdf; or an arm that is "
-            f"drawn, {RANDOM_ARM}:7"
+        raise ValueError(
+            f"unknown robot {text!r}: {known}; or a file: a factory calibration (.yaml), a DH table (.toml) or a "
+            f".urdf; or an arm that is drawn, {RANDOM_ARM}:7"
         )
-        raise ValueError(f"unknown robot {text!r}: {wanted}")
     return _read(text, _changed("robot", path))
 
 

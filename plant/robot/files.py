@@ -53,9 +53,10 @@ def read_calibrated_robot(path: Path) -> Robot:
     sheet = universal_robot(title)
     measured = read_calibration(path, sheet.arm.tool)
     source = f"{path.name}, held against {sheet.source}"
-    within = f"its flange within {1e3 * deviation:.1f} mm of the data sheet's"
-    roles = f"the true robot is the calibrated arm, controllers know the data sheet's {title}"
-    note = f"{path.name} is the factory calibration of a {title} ({within}): {roles}"
+    note = (
+        f"{path.name} is the factory calibration of a {title} (its flange within {1e3 * deviation:.1f} mm of the "
+        f"data sheet's): the true robot is the calibrated arm, controllers know the data sheet's {title}"
+    )
     return replace(sheet, name=path.stem, source=source, measured=measured, note=note)
 
 

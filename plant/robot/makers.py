@@ -138,8 +138,10 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
     if file is None and robot.measured is not None:
         return robot.measured
     if robot.title not in UNIVERSAL_ROBOTS:
-        wanted = f"a calibration file of Universal Robots, which a {robot.title} does not have"
-        raise ValueError(f"mismatch 'factory' needs {wanted}; use the axes links and joint_offsets")
+        raise ValueError(
+            f"mismatch 'factory' needs a calibration file of Universal Robots, which a {robot.title} does not "
+            "have; use the axes links and joint_offsets"
+        )
     if file is None and robot.title != "UR5":
         other = f"the calibration of one real UR5, and the robot is a {robot.title}"
         raise ValueError(

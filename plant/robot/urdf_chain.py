@@ -273,9 +273,9 @@ def _ending(tree: Tree, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) 
     if len(following) == 1:
         (joint,) = following
         if joint.name not in mimicked and _is_axis(joint):
-            remedy = f"#{tip} leaves it out"
             raise ValueError(
-                f"joint {joint.name!r} after {last.name!r} is of type prismatic, which is not modelled; {remedy}"
+                f"joint {joint.name!r} after {last.name!r} is of type prismatic, which is not modelled; #{tip} "
+                "leaves it out"
             )
     lines = []
     if following:

@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm, freeze_arrays
-from servobench.plant.robot.camera import CAMERA, PinholeCamera
+from servobench.plant.robot.camera import CAMERA, IntArray, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
 CENTRE: Final = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
@@ -117,7 +117,7 @@ MIN_TUBE_LENGTH: Final = (
 class Tubes:
     """The tubes of an arm."""
 
-    link: npt.NDArray[np.intp]  # (s,), the index of each tube's link
+    link: IntArray  # (s,), the index of each tube's link
     ends: FloatArray  # (s, 2, 3) [m], in the frame of the link
     radius: FloatArray  # (s,) [m]
 
@@ -153,7 +153,7 @@ class Clearance:
     scale: float  # all lengths over those of a UR5's bench
     ball_radius: float  # [m]
     # (p, 2), tubes that must not meet
-    pairs: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
+    pairs: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
     camera: PinholeCamera = CAMERA  # its image
 
     def __call__(self, joint_position: FloatArray, *, singular: bool = False) -> BoolArray:
@@ -192,7 +192,7 @@ class Clearance:
         singular_values = np.linalg.svd(motions.mT, compute_uv=False)
         return np.asarray(singular_values[..., -1])
 
-    def gaps(self, placed: FloatArray, pairs: npt.NDArray[np.intp]) -> FloatArray:
+    def gaps(self, placed: FloatArray, pairs: IntArray) -> FloatArray:
         """Return the free distance of pairs of tubes, (..., p) m; negative where they overlap."""
         first = placed[..., pairs[:, 0], :, :]
         second = placed[..., pairs[:, 1], :, :]
@@ -215,7 +215,7 @@ class Clearance:
         return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
 
 
-def collision_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
+def collision_pairs(clearance: Clearance, postures: FloatArray) -> IntArray:
     """Return the pairs of tubes, (p, 2), that can collide: not of neighbours, and separate in most of (k, n) rad."""
     link = clearance.tubes.link
     i, j = np.triu_indices(len(link), 1)
@@ -316,8 +316,10 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
     if found is not None:
         return found
     if arm.n < 3 or length_scale(arm) == 0.0:
-        size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
-        raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
+        raise ValueError(
+            f"an arm has three joints or more and links with lengths, got {arm.n} joints and links of "
+            f"{LENGTH_OF_UR5 * length_scale(arm):g} m in all"
+        )
     look = _likely_cause(arm, limits, shapes)
     raise ValueError(
         "the arm has no posture in which its ball is over the table, in view of the camera and free of contact; "
