@@ -19,9 +19,9 @@ class ExportDialect:
 
     names: FmiDialect  # those that an importer knows as well
     headers: tuple[str, ...]  # those of the standard that the C sources include
-    # Whether a variable may be an array, described once and found by its value reference; else every number is a
-    # variable, found by its place in the list.
-    arrays: bool
+    arrays: bool  # whether a variable may be an array; else every number is a variable
+    reference: str  # attribute by which an unknown names its variable
+    first_index: int  # number of the first variable where one names another
     sections: Mapping[
         str, str
     ]  # part of the model structure -> its element; without one it is left out
@@ -39,6 +39,8 @@ _FMI2: Final = ExportDialect(
     names=FMI2,
     headers=("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     arrays=False,
+    reference="index",
+    first_index=1,
     sections={
         OUTPUTS: "Outputs",
         DERIVATIVES: "Derivatives",
@@ -58,6 +60,8 @@ _FMI3: Final = ExportDialect(
     names=FMI3,
     headers=("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
     arrays=True,
+    reference="valueReference",
+    first_index=0,
     sections={
         OUTPUTS: "Output",
         DERIVATIVES: "ContinuousStateDerivative",

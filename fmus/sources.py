@@ -82,8 +82,9 @@ def layout_header(
         values += [float(value).hex() for value in group_values]
     minima: list[str] = []
     for group in settable:
-        minimum = "-HUGE_VAL" if group.minimum is None else group.minimum.hex()
-        minima += [minimum] * group.size
+        minimum = dict(group.attributes).get("min")
+        bound = "-HUGE_VAL" if minimum is None else float(minimum).hex()
+        minima += [bound] * group.size
     macros: dict[str, object] = {
         "TOKEN": f'"{token}"',
         "N_GROUPS": len(layout.groups),
