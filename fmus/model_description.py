@@ -168,13 +168,11 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
     Args:
         files: path relative to the manifest, role and description of each related CSV file.
     """
-    namespace = "http://fmi-standard.org/fmi-ls-manifest"
-    ET.register_namespace("fmi-ls", namespace)
     attributes = {
-        f"{{{namespace}}}fmi-ls-name": REFERENCES,
-        f"{{{namespace}}}fmi-ls-version": REFERENCES_VERSION,
-        f"{{{namespace}}}fmi-ls-description": "Layered Standard providing information on related files included in "
-        "an FMU.",
+        "xmlns:fmi-ls": "http://fmi-standard.org/fmi-ls-manifest",
+        "fmi-ls:fmi-ls-name": REFERENCES,
+        "fmi-ls:fmi-ls-version": REFERENCES_VERSION,
+        "fmi-ls:fmi-ls-description": "Layered Standard providing information on related files included in an FMU.",
     }
     root = ET.Element("fmiReferences", attributes)
     for source, role, text in files:
