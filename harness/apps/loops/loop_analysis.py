@@ -26,7 +26,6 @@ from servobench.harness.apps.loops.equilibrium import (
     TASK,
     Rest,
     Source,
-    Warm,
     at_rest,
     linearise,
     warm_up,
@@ -325,45 +324,24 @@ def analyse_loop(
     """
     with one_thread():
         warm = warm_up(resolved)
-        name = resolved.request.controller
+        arm = warm.arm
+        m, n = arm.jacobian.shape
+        steps = round(STEP_DURATION / arm.period)
         if isinstance(warm.controller, ServoController) and not identify:
-            return _linearised(name, warm, source)
-        return _identified(name, warm)
-
-
-def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
-    """Return the loop of a composed controller, linearised with a frozen estimator."""
-    arm = warm.arm
-    controller = linearise(*at_rest(warm, source))
-    closed = closed_loop(arm.matrices(), controller)
-    response = linear_response(controller, arm)
-    steps = round(STEP_DURATION / arm.period)
-    return LoopAnalysis(
-        name=name,
-        model="linearised",
-        stable=is_stable(closed.A),
-        margins=response.margins(),
-        response=response,
-        step=closed.step(len(arm.jacobian), arm.period, steps),
-    )
-
-
-def _identified(name: str, warm: Warm) -> LoopAnalysis:
-    """Return the loop of any controller, identified from logged data."""
-    arm = warm.arm
-    m, n = arm.jacobian.shape
-    loop = SmallMotions(warm.controller, arm, warm.rest)
-    frequency, controller = controller_response(excite(loop, m + n), arm.period)
-    response = LoopResponse(frequency, controller, arm)
-    steps = round(STEP_DURATION / arm.period)
-    return LoopAnalysis(
-        name=name,
-        model="identified",
-        stable=True,  # an unstable one has ended the experiments
-        margins=response.margins(),
-        response=response,
-        step=step_responses(loop, m, n, steps),
-    )
+            model = "linearised"
+            controller = linearise(*at_rest(warm, source))
+            closed = closed_loop(arm.matrices(), controller)
+            stable = is_stable(closed.A)
+            response = linear_response(controller, arm)
+            step = closed.step(m, arm.period, steps)
+        else:
+            model = "identified"
+            loop = SmallMotions(warm.controller, arm, warm.rest)
+            stable = True  # an unstable one has ended the experiments
+            response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)
+            step = step_responses(loop, m, n, steps)
+        name = resolved.request.controller
+        return LoopAnalysis(name, model, stable, response.margins(), response, step)
 
 
 def delay_margin(
