@@ -38,8 +38,8 @@ from servobench.harness.apps.figures.style import (
     save_figure,
 )
 from servobench.harness.apps.figures.tracks import (
-    Ensembles,
     Group,
+    Tasks,
     load_ensembles,
     load_groups,
     longest,
@@ -217,9 +217,7 @@ def _sample(kind: str, group: Group) -> str:
     return words
 
 
-def _plans(
-    group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int
-) -> Iterator[_Plan]:
+def _plans(group: Group, ensembles: Tasks, styles: Styles, size: int) -> Iterator[_Plan]:
     """Yield the figures of a group: of its moves, of its curves, and of both."""
     moves = {task: tracks for task, tracks in group.tasks.items() if longest(tracks).point_to_point}
     runs = group.runs

@@ -68,6 +68,8 @@ LETTER = 0.066  # [in] width of a letter of the legend
 SAMPLE = 0.55  # [in] width of the sample line of a legend
 MARGIN: Final = 0.2  # [in] on both sides of the legend
 DESIRED: Final[dict[str, Any]] = _SHEET["desired"]
+BOX: Final[dict[str, Any]] = _SHEET["box"]  # around words in a panel
+MARKS_OF: Final[dict[str, dict[str, Any]]] = _SHEET["marks"]
 DASHED = (0, (3.5, 1.5))  # line of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 
@@ -147,11 +149,10 @@ class MethodStyle:
         return {
             "color": self.colour,
             "linestyle": self.line,
-            "linewidth": 1.2,
             "marker": self.marker,
-            "markersize": 4.0,
             "markerfacecolor": self.face,
             "markevery": (first, step),
+            **_SHEET["line"],
         }
 
     def path_arguments(self, points: FloatArray) -> dict[str, Any]:
@@ -281,20 +282,20 @@ def finish_columns(figure: Figure, panels: np.ndarray) -> None:
     add_legend(figure, panels.flat)
 
 
+def write_inside(
+    axes: Axes,
+    words: str,
+    place: tuple[float, float] = (0.5, 0.5),
+    **look: Any,  # noqa: ANN401 - as matplotlib's
+) -> None:
+    """Write words at a place of a panel, [1] of its width and height; in grey at its centre without another look."""
+    axes.text(*place, words, transform=axes.transAxes, **{**_SHEET["remark"], **look})
+
+
 def mark_end(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle) -> None:
     """Mark the last known point (x, y) of a run that ended early."""
     last = np.flatnonzero(np.isfinite(y))[-1]
-    axes.plot(
-        x[last],
-        y[last],
-        color=style.colour,
-        marker=END,
-        markersize=12,
-        markeredgewidth=2.0,
-        linestyle="",
-        zorder=12,
-        gid=ENDED,
-    )
+    axes.plot(x[last], y[last], color=style.colour, marker=END, gid=ENDED, **MARKS_OF["end"])
 
 
 def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
@@ -307,14 +308,7 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     groups = {line.get_gid() for axes in panels for line in axes.get_lines()}
     for gid, marker in ((SETTLED, "^"), (ENDED, END)):
         if gid in groups:
-            entries[gid] = mpl.lines.Line2D(
-                [],
-                [],
-                color="0.3",
-                marker=marker,
-                markersize=7,
-                linestyle="",
-            )
+            entries[gid] = mpl.lines.Line2D([], [], marker=marker, **MARKS_OF["legend"])
     entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))
     if not entries:
         return
@@ -326,12 +320,9 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     figure.legend(
         list(entries.values()),
         labels,
-        loc="outside lower center",
-        frameon=False,
         fontsize=TEXT - 0.5,
         ncols=max(1, min(fitting, len(entries))),
-        handlelength=2.6,
-        columnspacing=1.2,
+        **_SHEET["legend"],
     )
 
 

@@ -251,6 +251,7 @@ class Ensemble(Shown):
 
 
 Ensembles = dict[str, Ensemble]
+Tasks = Mapping[str, Ensembles]
 
 
 def quantile(values: FloatArray, share: float) -> FloatArray:
@@ -288,7 +289,7 @@ def _camera_move(configuration: Mapping[str, Mapping[str, Any]]) -> float:
     return math.nan
 
 
-def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
+def shown_until(ensembles: Ensembles) -> float:
     """Return until when a figure shows these runs [s]: a move until well after the slowest method has settled."""
     each = list(ensembles.values())
     end = max(float(ensemble.time[-1]) for ensemble in each)
