@@ -304,10 +304,10 @@ def loci(L: ComplexArray) -> ComplexArray:
 class Crossings(NamedTuple):
     """Where loci change the sign of a level between two frequencies."""
 
-    row: npt.NDArray[np.intp]  # of the frequency before, (crossings,)
+    row: npt.NDArray[np.intp]  # index of the frequency before, (crossings,)
     before: ComplexArray  # locus at that frequency
     after: ComplexArray  # locus at the next one
-    share: FloatArray  # of the way between both, after which the level is 0
+    share: FloatArray  # part of the way between both, after which the level is 0
 
 
 def _crossings(values: ComplexArray, level: FloatArray) -> Crossings:
