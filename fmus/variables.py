@@ -38,6 +38,10 @@ INDICATOR: Final = "event indicator"
 OUTPUT: Final = "output"
 SAMPLED: Final = "sampled output"
 
+# Settings of the mechanics: of each joint, and of the tool.
+GEARS: Final = ("backlash", "ripple", "ripple_order")
+TOOL: Final = ("tool_frequency", "tool_damping")
+
 # Parts of the generated core.
 ARGUMENT: Final = "argument"
 RESULT: Final = "result"
@@ -267,19 +271,13 @@ def _arm_parameters(arm: SerialArm) -> dict[str, FloatArray]:
 
     Its first transform leads to joint 1, the others from joint i to joint i + 1.
     """
-    base_position = arm.translation[..., 0, :]
-    base_rpy = arm.rpy[..., 0, :]
-    translation = arm.translation[..., 1:, :]
-    rpy = arm.rpy[..., 1:, :]
+    columns = np.concatenate([arm.translation, arm.rpy], axis=-1)
+    names = ("a", "y", "d", "alpha", "pitch", "yaw")
+    links = np.moveaxis(columns[..., 1:, :], -1, 0)
     return {
-        "base_position": base_position,
-        "base_rpy": base_rpy,
-        "a": translation[..., 0],
-        "y": translation[..., 1],
-        "d": translation[..., 2],
-        "alpha": rpy[..., 0],
-        "pitch": rpy[..., 1],
-        "yaw": rpy[..., 2],
+        "base_position": arm.translation[..., 0, :],
+        "base_rpy": arm.rpy[..., 0, :],
+        **dict(zip(names, links, strict=True)),
         "joint_offset": arm.joint_offset,
         "gear_ratio": arm.gear_ratio,
     }
@@ -287,38 +285,30 @@ def _arm_parameters(arm: SerialArm) -> dict[str, FloatArray]:
 
 def _mechanics_parameters(mechanics: MechanicsConfig, n: int) -> dict[str, FloatArray]:
     """Return the values of the parameters of gears, the same for all n joints, and of the tool by name, (size,)."""
-    return {
-        "backlash": np.full(n, mechanics.backlash),
-        "ripple": np.full(n, mechanics.ripple),
-        "ripple_order": np.full(n, mechanics.ripple_order),
-        "tool_frequency": np.array([mechanics.tool_frequency]),
-        "tool_damping": np.array([mechanics.tool_damping]),
-    }
+    gears = {name: np.full(n, getattr(mechanics, name)) for name in GEARS}
+    return gears | {name: np.array([getattr(mechanics, name)]) for name in TOOL}
 
 
 def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
     """Return the values of the parameters of target and cameras by name, (..., size)."""
     if not isinstance(model, SetupModel):
-        X_BC = model.camera
-        return {
-            "tool": model.arm.tool,
-            "camera_position": X_BC[..., :3, 3],
-            "camera_rpy": rpy_from_rotation(X_BC[..., :3, :3]),
-        }
+        return {"tool": model.arm.tool, **_camera_parameters(model.camera)}
     optics = model.optics
-    positions = model.cameras[..., :3, 3]
-    angles = rpy_from_rotation(model.cameras[..., :3, :3])
     values = {
-        "target": _flat(model.target),
-        "camera_position": _flat(positions),
-        "camera_rpy": _flat(angles),
-        "focal_length": optics.focal,
-        "principal_point": _flat(optics.centre),
-        "distortion": optics.distortion,
+        "target": model.target,
+        **_camera_parameters(model.cameras),
+        "principal_point": optics.centre,
     }
     if optics.further is not None:
-        values["calibration"] = _flat(optics.further)
-    return values
+        values["calibration"] = optics.further
+    flat = {name: _flat(matrix) for name, matrix in values.items()}
+    return {**flat, "focal_length": optics.focal, "distortion": optics.distortion}
+
+
+def _camera_parameters(X_BC: FloatArray) -> dict[str, FloatArray]:
+    """Return position and angles of cameras, (..., 3), by name."""
+    angles = rpy_from_rotation(X_BC[..., :3, :3])
+    return {"camera_position": X_BC[..., :3, 3], "camera_rpy": angles}
 
 
 def _flat(values: FloatArray) -> FloatArray:

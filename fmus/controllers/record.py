@@ -52,6 +52,11 @@ _LOCK = RLock()
 Traced.function = staticmethod(carry_out)
 
 
+def _keeping(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a function of numpy that leaves traced arrays as they are."""
+    return lambda value: value if isinstance(value, Traced) else function(value)
+
+
 class _Numpy:
     """numpy, except for the functions that make arrays."""
 
@@ -75,17 +80,8 @@ class _Numpy:
             return same.copy()
         return np.array(value, dtype=_real(dtype), **options)
 
-    @staticmethod
-    def ascontiguousarray(value: Any) -> Any:  # noqa: ANN401 - as numpy's
-        if isinstance(value, Traced):
-            return value
-        return np.ascontiguousarray(value)
-
-    @staticmethod
-    def float64(value: Any) -> Any:  # noqa: ANN401 - as numpy's
-        if isinstance(value, Traced):
-            return value
-        return np.float64(value)
+    ascontiguousarray = staticmethod(_keeping(np.ascontiguousarray))
+    float64 = staticmethod(_keeping(np.float64))
 
     @staticmethod
     def zeros(shape: Any, dtype: Any = np.float64) -> Traced:  # noqa: ANN401 - as numpy's
