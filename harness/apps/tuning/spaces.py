@@ -362,9 +362,7 @@ def _step(distribution: FloatDistribution | IntDistribution, value: float, sign:
     size = STEP * abs(value) or STEP_FROM_ZERO * distribution.high
     if distribution.step is not None:
         size = distribution.step * max(1, round(size / distribution.step))
-    moved = min(max(value + sign * size, distribution.low), distribution.high)
-    if isinstance(distribution, IntDistribution):
-        return int(moved)
+    moved: float = _within(distribution, value + sign * size, value)
     return moved
 
 
