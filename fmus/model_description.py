@@ -5,11 +5,13 @@ equal models give equal bytes.
 """
 
 import math
+import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
@@ -34,34 +36,13 @@ from servobench.fmus.variables import (
 )
 from servobench.plant.contract.checks import FloatArray
 
-UNITS: dict[str, dict[str, str]] = {
-    "1": {},
-    "m": {"m": "1"},
-    "rad": {"rad": "1"},
-    "s": {"s": "1"},
-    "rad/s": {"rad": "1", "s": "-1"},
-    "rad/s2": {"rad": "1", "s": "-2"},
-    "m/rad": {"m": "1", "rad": "-1"},
-    "m/s": {"m": "1", "s": "-1"},
-    "m/s2": {"m": "1", "s": "-2"},
-}
-DISPLAY_UNITS = {"rad": "deg", "rad/s": "deg/s", "rad/s2": "deg/s2"}
-ATTRIBUTES = {
-    PARAMETER: {"causality": "parameter", "variability": "tunable", "initial": "exact"},
-    FIXED: {"causality": "parameter", "variability": "fixed", "initial": "exact"},
-    INPUT: {"causality": "input", "variability": "continuous"},
-    STATE: {"causality": "output", "variability": "continuous", "initial": "calculated"},
-    DERIVATIVE: {"causality": "local", "variability": "continuous", "initial": "calculated"},
-    INDICATOR: {"causality": "local", "variability": "continuous", "initial": "calculated"},
-    OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
-    SAMPLED: {"causality": "output", "variability": "discrete", "initial": "calculated"},
-}
+_TABLES = tomllib.loads(
+    Path(__file__).with_name("model_description.toml").read_text(encoding="utf-8")
+)
+UNITS: dict[str, dict[str, str]] = _TABLES["units"]
+DISPLAY_UNITS: dict[str, str] = _TABLES["display_units"]
+ATTRIBUTES: dict[str, dict[str, str]] = _TABLES["roles"]
 STARTED = (PARAMETER, FIXED, INPUT)  # roles with start values
-LOG_CATEGORIES = {
-    "logStatusError": "Errors.",
-    "logStatusWarning": "Refused calls.",
-    "logEvents": "Joints that meet a stop or leave it.",
-}
 REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard for the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
 # Part of the model structure -> roles of its unknowns.
@@ -111,7 +92,7 @@ def write_description(description: Description, dialect: ExportDialect, token: s
     _interfaces(root, description, dialect)
     _units(root, {group.unit for group in description.layout.groups})
     categories = ET.SubElement(root, "LogCategories")
-    for name, text in LOG_CATEGORIES.items():
+    for name, text in _TABLES["log_categories"].items():
         ET.SubElement(categories, "Category", name=name, description=text)
     experiment = {
         "startTime": "0",

@@ -25,7 +25,6 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
-from servobench.plant.robot.mechanics import MechanicsConfig
 
 ARM: Final = "ur5_mismatched"  # folder of the model that serves every arm
 # Roles of variables.
@@ -256,7 +255,8 @@ def parameters_of(setup: PlantSetup, config: KinematicConfig) -> dict[str, Float
     return {
         **_arm_parameters(model.arm),
         **_sensing_parameters(model),
-        **_mechanics_parameters(config.mechanics, n),
+        **{name: np.full(n, getattr(config.mechanics, name)) for name in GEARS},
+        **{name: np.array([getattr(config.mechanics, name)]) for name in TOOL},
         "lag": np.full(n, config.lag),
         "max_speed": stops.speed,
         "joint_lower": stops.lower,
@@ -281,12 +281,6 @@ def _arm_parameters(arm: SerialArm) -> dict[str, FloatArray]:
         "joint_offset": arm.joint_offset,
         "gear_ratio": arm.gear_ratio,
     }
-
-
-def _mechanics_parameters(mechanics: MechanicsConfig, n: int) -> dict[str, FloatArray]:
-    """Return the values of the parameters of gears, the same for all n joints, and of the tool by name, (size,)."""
-    gears = {name: np.full(n, getattr(mechanics, name)) for name in GEARS}
-    return gears | {name: np.array([getattr(mechanics, name)]) for name in TOOL}
 
 
 def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:

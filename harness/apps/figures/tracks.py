@@ -267,7 +267,7 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
 
 def load_ensembles(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Ensembles]:
     """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
-    camera_moves_at = _camera_move(folder.configuration)
+    moves_at = folder.configuration.get("run", {}).get("camera_moves_at")
     tracks: dict[tuple[str, str], list[Track]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
         key = track.row["task"], track.row["controller"]
@@ -276,17 +276,9 @@ def load_ensembles(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Ensem
     never = unbegun.groupby(["task", "controller"]).size()
     ensembles: dict[str, Ensembles] = {}
     for (task, name), own in tracks.items():
-        ensemble = _ensemble(own, int(never.get((task, name), 0)), camera_moves_at)
+        ensemble = _ensemble(own, int(never.get((task, name), 0)), moves_at)
         ensembles.setdefault(task, {})[name] = ensemble
     return ensembles
-
-
-def _camera_move(configuration: Mapping[str, Mapping[str, Any]]) -> float:
-    """Return after which share of a run the camera moves, by the settings of a folder; NaN without one."""
-    share = configuration.get("run", {}).get("camera_moves_at")
-    if isinstance(share, int | float) and 0.0 <= share < 1.0:
-        return share
-    return math.nan
 
 
 def shown_until(ensembles: Ensembles) -> float:
@@ -301,7 +293,7 @@ def shown_until(ensembles: Ensembles) -> float:
     return min(end, max(MARGIN * max(known), MIN_SHARE * end))
 
 
-def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> Ensemble:
+def _ensemble(tracks: Sequence[Track], never: int, moves_at: object) -> Ensemble:
     """Return the ensemble of tracks and of runs that never began; a camera moves after that share of a run."""
     runs = pd.DataFrame([track.row for track in tracks])
     longest_track = max(tracks, key=lambda track: len(track.table))
@@ -330,13 +322,13 @@ def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> En
         step_time=step_times[step_times > 0.0],
         settling_time=float(np.median(settled_after)),
         mostly_ended=bool(ended_early / (len(runs) + never) >= BAND[1]),
-        camera_moved_at=_camera_moved_at(runs, longest_track, camera_moves_at),
+        camera_moved_at=_camera_moved_at(runs, longest_track, moves_at),
     )
 
 
-def _camera_moved_at(runs: pd.DataFrame, longest: Track, share: float) -> float:
+def _camera_moved_at(runs: pd.DataFrame, longest: Track, share: object) -> float:
     """Return when the camera was moved [s], after a share of the longest run; NaN where it was not."""
     moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
-    if not moves or math.isnan(share):
+    if not moves or not isinstance(share, int | float) or not 0.0 <= share < 1.0:
         return math.nan
     return float(longest.time[int(share * len(longest.time))])
