@@ -130,15 +130,14 @@ def resolution(table: pd.DataFrame) -> float:
     for _ in range(SPLITS):
         # Robots have one order in all challenges; each challenge is halved where half of its own robots are passed.
         order = generator.permutation(len(robots))[robot_of_row]
-        first, second = [], []
+        halves = []
         for own in rows:
             shuffled = own[np.argsort(order[own])]
-            middle = len(own) // 2
-            first.append(shuffled[:middle])
-            second.append(shuffled[middle:])
-        first_means = _middle_means(values[:, np.concatenate(first)])
-        second_means = _middle_means(values[:, np.concatenate(second)])
-        differences.append(np.abs(first_means - second_means))
+            halves.append(np.split(shuffled, [len(own) // 2]))
+        first, second = (
+            _middle_means(values[:, np.concatenate(half)]) for half in zip(*halves, strict=True)
+        )
+        differences.append(np.abs(first - second))
     return float(np.median(differences))
 
 
