@@ -95,11 +95,14 @@ class Track(Shown):
         """Whether the run has too many rows to draw them one by one."""
         return len(self.table) > LONG
 
+    @property
+    def step(self) -> int:
+        """Number of rows for which one row of an overview stands."""
+        return len(self.table) // OVERVIEW if self.long else 1
+
     def overview(self) -> Self:
         """Return the track with few rows; errors are root mean squares over all rows for which one stands."""
-        if not self.long:
-            return self
-        return self.thinned(len(self.table) // OVERVIEW)
+        return self.thinned(self.step)
 
     def thinned(self, step: int) -> Self:
         """Return the track with every `step`-th row, which has the root mean square of errors over these rows."""
@@ -298,8 +301,7 @@ def _ensemble(tracks: Sequence[Track], never: int, moves_at: object) -> Ensemble
     runs = pd.DataFrame([track.row for track in tracks])
     longest_track = max(tracks, key=lambda track: len(track.table))
     # All runs of an ensemble are thinned alike, so that they have common instants.
-    step = len(longest_track.table) // OVERVIEW if longest_track.long else 1
-    few = [track.thinned(step) for track in tracks]
+    few = [track.thinned(longest_track.step) for track in tracks]
     time = max((track.time for track in few), key=len)
 
     def padded(values: FloatArray, filling: float) -> FloatArray:
