@@ -52,11 +52,6 @@ _LOCK = RLock()
 Traced.function = staticmethod(carry_out)
 
 
-def _keeping(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a function of numpy that leaves traced arrays as they are."""
-    return lambda value: value if isinstance(value, Traced) else function(value)
-
-
 class _Numpy:
     """numpy, except for the functions that make arrays."""
 
@@ -80,8 +75,17 @@ class _Numpy:
             return same.copy()
         return np.array(value, dtype=_real(dtype), **options)
 
-    ascontiguousarray = staticmethod(_keeping(np.ascontiguousarray))
-    float64 = staticmethod(_keeping(np.float64))
+    @staticmethod
+    def ascontiguousarray(value: Any) -> Any:  # noqa: ANN401 - as numpy's
+        if isinstance(value, Traced):
+            return value
+        return np.ascontiguousarray(value)
+
+    @staticmethod
+    def float64(value: Any) -> Any:  # noqa: ANN401 - as numpy's
+        if isinstance(value, Traced):
+            return value
+        return np.float64(value)
 
     @staticmethod
     def zeros(shape: Any, dtype: Any = np.float64) -> Traced:  # noqa: ANN401 - as numpy's
@@ -92,7 +96,7 @@ class _Numpy:
     @staticmethod
     def full(shape: Any, value: Any, dtype: Any = None) -> Traced:  # noqa: ANN401 - as numpy's
         if isinstance(value, Traced):
-            return value.arranged(np.broadcast_to(value.places, shape)).copy()
+            return spread(value, shape).copy()
         return Traced.plain(np.full(shape, value, dtype=_real(dtype)))
 
     @staticmethod
@@ -103,8 +107,6 @@ class _Numpy:
 
     @staticmethod
     def broadcast_to(array: Any, shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
-        if isinstance(shape, int):
-            shape = (shape,)
         return spread(as_traced(array), shape)
 
 
