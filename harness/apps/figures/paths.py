@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import matplotlib as mpl
@@ -24,7 +23,7 @@ from servobench.harness.apps.figures.style import (
     mark_end,
     way_along,
 )
-from servobench.harness.apps.figures.tracks import Track, Tracks, label_of, longest
+from servobench.harness.apps.figures.tracks import Track, Tracks, TracksByTask, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
 COLUMNS: Final = 2
@@ -53,7 +52,7 @@ class View(NamedTuple):
     upright: int
 
 
-def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+def draw_paths(tasks: TracksByTask, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw the true paths of one run of each controller in two views, to scale; None with fewer than two features.
 
     Start, target and desired path are in black, an arrow shows in which direction a curve is followed.
@@ -91,7 +90,7 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     return figure
 
 
-def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[tuple[str, Tracks, _Extent]]:
+def _blocks(tasks: TracksByTask, views: list[View]) -> list[tuple[str, Tracks, _Extent]]:
     """Return title, tracks and extent of each task and division of methods; a task has the same extent in all."""
     blocks = []
     for task, whole in tasks.items():

@@ -51,6 +51,7 @@ from servobench.harness.apps.figures.tracks import (
     Tasks,
     Track,
     Tracks,
+    TracksByTask,
     label_of,
     longest,
     quantile,
@@ -111,7 +112,7 @@ def draw_jacobians(tasks: Tasks, styles: Styles, layout: Layout = WIDE) -> Figur
 
 
 def draw_features(
-    tasks: Mapping[str, Tracks], until: Mapping[str, float], styles: Styles, layout: Layout = WIDE
+    tasks: TracksByTask, until: Mapping[str, float], styles: Styles, layout: Layout = WIDE
 ) -> Figure:
     """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
 
@@ -196,7 +197,7 @@ def _draw_tasks(
     return figure, drawn
 
 
-def _features(tasks: Mapping[str, Tracks]) -> list[str]:
+def _features(tasks: TracksByTask) -> list[str]:
     """Return the names of the features in the order of the plant; those of the richest track count."""
     return max((track.features for tracks in tasks.values() for track in tracks.values()), key=len)
 

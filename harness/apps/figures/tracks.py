@@ -144,6 +144,7 @@ class Track(Shown):
 
 
 Tracks = dict[str, Track]
+TracksByTask = Mapping[str, Tracks]
 
 
 @dataclass(frozen=True, eq=False)
