@@ -156,7 +156,7 @@ def draw(panels: dict[str, tuple[str, Curves]], path: Path) -> None:
                     "linestyle": ":" if "one run" in label else "-"
                 }
                 if "limits active" in label:
-                    look |= {"color": style.VERMILION}
+                    look |= {"color": style.COLOURS["vermilion"]}
                 axes.loglog(
                     sizes, [1e6 * cost for cost in costs], **look, label=label.replace("`", "")
                 )

@@ -22,8 +22,9 @@ from servobench.harness.run.experiment import build
 from servobench.plant.bench.bench import Bench
 
 COLOURS = {
-    "plant": style.BLUE, "estimator": style.VERMILION, "law": style.ORANGE, "aids": style.GREEN,
-    "log, judging": style.YELLOW, "building": style.WINE, "rest": "#BBBBBB",
+    "plant": style.COLOURS["blue"], "estimator": style.COLOURS["vermilion"], "law": style.COLOURS["orange"],
+    "aids": style.COLOURS["green"], "log, judging": style.COLOURS["yellow"],
+    "building": style.COLOURS["wine"], "rest": "#BBBBBB",
 }  # fmt: skip
 # Functions that all methods share
 SHARED = (

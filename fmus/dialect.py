@@ -1,7 +1,9 @@
 """What differs between the versions of FMI in the files of an exported FMU: one row of facts for each version."""
 
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from servobench.plant.fmu.dialect import FMI2, FMI3, FmiDialect
@@ -18,58 +20,26 @@ class ExportDialect:
     """The names of one version of FMI in the files of an FMU."""
 
     names: FmiDialect  # those that an importer knows as well
-    headers: tuple[str, ...]  # those of the standard that the C sources include
-    # Whether a variable may be an array, described once and found by its value reference; else every number is a
-    # variable, found by its place in the list.
-    arrays: bool
-    sections: Mapping[
-        str, str
-    ]  # part of the model structure -> its element; without one it is left out
-    capabilities: tuple[str, ...]  # those that every model has
-    differentiation: tuple[str, ...]  # capabilities of models with derivatives
-    indicator_count: str | None  # attribute of the description; None: importers count themselves
+    headers: Sequence[str]  # those of the standard that the C sources include
+    arrays: bool  # whether a variable may be an array; else every number is a variable
+    reference: str  # attribute by which an unknown names its variable
+    first_index: int  # number of the first variable where one names another
+    # Part of the model structure -> its element; without one it is left out.
+    sections: Mapping[str, str]
+    capabilities: Sequence[str]  # those that every model has
+    differentiation: Sequence[str]  # capabilities of models with derivatives
     # Whether sources are listed in the description; else in a file of their own.
     describes_sources: bool
-    exchange: Mapping[str, str] = field(
-        default_factory=dict
-    )  # further attributes of model exchange
+    # Attribute of the description; None: importers count themselves.
+    indicator_count: str | None = None
+    # Further attributes of model exchange.
+    exchange: Mapping[str, str] = field(default_factory=dict)
 
 
-_FMI2: Final = ExportDialect(
-    names=FMI2,
-    headers=("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    arrays=False,
-    sections={
-        OUTPUTS: "Outputs",
-        DERIVATIVES: "Derivatives",
-        INITIAL_UNKNOWNS: "InitialUnknowns",
-    },
-    capabilities=(
-        "canNotUseMemoryManagementFunctions",
-        "canGetAndSetFMUstate",
-        "canSerializeFMUstate",
-    ),
-    differentiation=("providesDirectionalDerivative",),
-    indicator_count="numberOfEventIndicators",
-    describes_sources=True,
-    exchange={"completedIntegratorStepNotNeeded": "false"},
-)
-_FMI3: Final = ExportDialect(
-    names=FMI3,
-    headers=("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
-    arrays=True,
-    sections={
-        OUTPUTS: "Output",
-        DERIVATIVES: "ContinuousStateDerivative",
-        INITIAL_UNKNOWNS: "InitialUnknown",
-        INDICATORS: "EventIndicator",
-    },
-    capabilities=("canGetAndSetFMUState", "canSerializeFMUState"),
-    differentiation=("providesDirectionalDerivatives", "providesAdjointDerivatives"),
-    indicator_count=None,
-    describes_sources=False,
-)
-EXPORTS: Final = {dialect.names.version: dialect for dialect in (_FMI2, _FMI3)}
+_TABLES: Final = tomllib.loads(Path(__file__).with_name("dialect.toml").read_text(encoding="utf-8"))
+EXPORTS: Final = {
+    names.version: ExportDialect(names, **_TABLES[names.prefix]) for names in (FMI2, FMI3)
+}
 
 
 def export_dialect(fmi_version: int) -> ExportDialect:

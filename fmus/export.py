@@ -11,11 +11,11 @@ import numpy as np
 
 from servobench.fmus.compiler import CODE, Platform, this_platform
 from servobench.fmus.dialect import export_dialect
-from servobench.fmus.model_description import Description, arm_sections, exporter
+from servobench.fmus.model_description import Description, exporter
 from servobench.fmus.product import Product, c_files, documentation, word
 from servobench.fmus.reference import reference_run, tables
 from servobench.fmus.sources import arm_constants, kinematics_source
-from servobench.fmus.variables import ArmLayout, View, arm_groups, parameters_of
+from servobench.fmus.variables import ARM, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import SETUPS, Sensing
 from servobench.plant.cameras.setups import SetupModel
@@ -25,10 +25,17 @@ from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
-MODEL = "ur5_mismatched"  # source folder; one C model serves every arm
 CORE = "kinematics"
 PACKAGES: Final = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
-SOURCES: Final = {".py", ".pyc", ".c", ".h", ".html", ".txt"}  # .pyc of an installation without .py
+SOURCES: Final = {
+    ".py",
+    ".pyc",
+    ".c",
+    ".h",
+    ".html",
+    ".txt",
+    ".csv",
+}  # .pyc of an installation without .py
 STEP: Final = 0.05  # [s] step of the default experiment
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
@@ -175,7 +182,7 @@ def product(options: ExportOptions) -> Product:
         mismatch = f"the mismatch “{options.mismatch}”"
     return Product(
         fmi_version=options.fmi_version,
-        folder=MODEL,
+        folder=ARM,
         core=CORE,
         source=kinematics_source(layout),
         constants=arm_constants(layout),
@@ -184,13 +191,12 @@ def product(options: ExportOptions) -> Product:
             model_identifier=options.identifier,
             summary=options.summary,
             layout=layout,
-            sections=arm_sections(layout),
             start=parameters_of(options.setup, options.config),
             sources=c_files(options.fmi_version, CORE),
             step=options.setup.period,
         ),
         documentation=documentation(
-            MODEL,
+            ARM,
             layout,
             title=options.title,
             summary=options.summary,

@@ -1,15 +1,19 @@
 """Writes modelDescription.xml for FMI 2.0 and 3.0: co-simulation and, where a model has it, model exchange.
 
-The dependencies of the unknowns are explicit (`Section`). The text holds no date and no machine name, so equal models
-give equal bytes.
+The dependencies of the unknowns are columns of the table of variables. The text holds no date and no machine name, so
+equal models give equal bytes.
 """
 
 import math
+import tomllib
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
-from typing import TypeAlias
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
 
 from servobench.fmus.dialect import (
     DERIVATIVES,
@@ -27,120 +31,27 @@ from servobench.fmus.variables import (
     PARAMETER,
     SAMPLED,
     STATE,
-    ArmLayout,
     Group,
     Layout,
 )
 from servobench.plant.contract.checks import FloatArray
 
-UNITS: dict[str, dict[str, str]] = {
-    "1": {},
-    "m": {"m": "1"},
-    "rad": {"rad": "1"},
-    "s": {"s": "1"},
-    "rad/s": {"rad": "1", "s": "-1"},
-    "rad/s2": {"rad": "1", "s": "-2"},
-    "m/rad": {"m": "1", "rad": "-1"},
-    "m/s": {"m": "1", "s": "-1"},
-    "m/s2": {"m": "1", "s": "-2"},
-}
-DISPLAY_UNITS = {"rad": "deg", "rad/s": "deg/s", "rad/s2": "deg/s2"}
-ATTRIBUTES = {
-    PARAMETER: {"causality": "parameter", "variability": "tunable", "initial": "exact"},
-    FIXED: {"causality": "parameter", "variability": "fixed", "initial": "exact"},
-    INPUT: {"causality": "input", "variability": "continuous"},
-    STATE: {"causality": "output", "variability": "continuous", "initial": "calculated"},
-    DERIVATIVE: {"causality": "local", "variability": "continuous", "initial": "calculated"},
-    INDICATOR: {"causality": "local", "variability": "continuous", "initial": "calculated"},
-    OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
-    SAMPLED: {"causality": "output", "variability": "discrete", "initial": "calculated"},
-}
+_TABLES = tomllib.loads(
+    Path(__file__).with_name("model_description.toml").read_text(encoding="utf-8")
+)
+UNITS: dict[str, dict[str, str]] = _TABLES["units"]
+DISPLAY_UNITS: dict[str, str] = _TABLES["display_units"]
+ATTRIBUTES: dict[str, dict[str, str]] = _TABLES["roles"]
 STARTED = (PARAMETER, FIXED, INPUT)  # roles with start values
-LOG_CATEGORIES = {
-    "logStatusError": "Errors.",
-    "logStatusWarning": "Refused calls.",
-    "logEvents": "Joints that meet a stop or leave it.",
-}
 REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard for the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
-
-# Rows hold an unknown, its dependencies, and whether it depends on them elementwise or as a whole.
-_Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]
-
-
-@dataclass(frozen=True)
-class Section:
-    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole."""
-
-    part: str  # one of those whose elements an `ExportDialect` names
-    layout: Layout
-    unknowns: _Rows
-
-    def scalars(self) -> Iterable[tuple[int, list[int]]]:
-        """Yield index and dependencies of every number, these in ascending order."""
-        for unknown, names, elementwise in self.unknowns:
-            for k in range(self.layout.by_name[unknown].size):
-                dependencies: list[int] = []
-                for name in names:
-                    first = self.layout.offsets[name]
-                    if elementwise:
-                        dependencies.append(first + k)
-                    else:
-                        dependencies += range(first, first + self.layout.by_name[name].size)
-                yield self.layout.offsets[unknown] + k, sorted(dependencies)
-
-    def arrays(self) -> Iterable[tuple[int, list[int]]]:
-        """Yield value reference and dependencies of every group."""
-        for unknown, names, _ in self.unknowns:
-            dependencies = sorted(self.layout.offsets[name] for name in names)
-            yield self.layout.offsets[unknown], dependencies
-
-
-def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
-    """Return outputs, derivatives, initial unknowns and event indicators of an arm with their dependencies."""
-    geometry = [group.name for group in layout.kinematic]
-    computed = [group.name for group in layout.computed]
-    joints = ("joint_position", "joint_velocity")
-    tool = ("tool_deflection", "tool_velocity")
-    command = "joint_velocity_command"
-    outputs: _Rows = [(name, (name,), True) for name in (*joints, *tool)]
-    outputs.append(("encoder_position", ("joint_position",), True))
-    outputs += [(name, ("joint_position", "tool_deflection"), False) for name in computed]
-    derivatives: _Rows = [
-        ("der(joint_position)", joints, True),
-        ("der(joint_velocity)", (*joints, command), True),
-        ("der(tool_deflection)", (*joints, *tool), False),
-        ("der(tool_velocity)", (*joints, *tool), False),
-    ]
-    start: _Rows = [
-        ("joint_position", ("home",), True),
-        ("joint_velocity", (), True),
-        ("der(joint_position)", (), True),
-        ("der(joint_velocity)", ("lag", "max_speed", command), True),
-        ("tool_deflection", (), True),
-        ("tool_velocity", (), True),
-        ("der(tool_deflection)", (), True),
-        ("der(tool_velocity)", (), True),
-        ("encoder_position", ("encoder_resolution", "home"), True),
-    ]
-    start += [(name, (*geometry, "home"), False) for name in computed]
-    indicators: _Rows = [("stop_indicator", ("joint_position", command), False)]
-    return (
-        Section(OUTPUTS, layout, outputs),
-        Section(DERIVATIVES, layout, derivatives),
-        Section(INITIAL_UNKNOWNS, layout, start),
-        Section(INDICATORS, layout, indicators),
-    )
-
-
-def sampled_sections(layout: Layout) -> tuple[Section, ...]:
-    """Return outputs and initial unknowns of a system in discrete time: every output depends on every input."""
-    inputs = tuple(group.name for group in layout.of_role(INPUT))
-    rows: _Rows = [(group.name, inputs, False) for group in layout.of_role(SAMPLED)]
-    return (
-        Section(OUTPUTS, layout, rows),
-        Section(INITIAL_UNKNOWNS, layout, rows),
-    )
+# Part of the model structure -> roles of its unknowns.
+UNKNOWNS = {
+    OUTPUTS: (STATE, OUTPUT, SAMPLED),
+    DERIVATIVES: (DERIVATIVE,),
+    INITIAL_UNKNOWNS: (STATE, DERIVATIVE, OUTPUT, SAMPLED),
+    INDICATORS: (INDICATOR,),
+}
 
 
 @dataclass(frozen=True)
@@ -151,7 +62,6 @@ class Description:
     model_identifier: str  # file name of the libraries
     summary: str  # one sentence
     layout: Layout  # the variables
-    sections: tuple[Section, ...]  # parts of the model structure
     # Start values of parameters and inputs, flat arrays by group; all others are zero.
     start: Mapping[str, FloatArray]
     sources: tuple[str, ...]  # C files to compile, in order
@@ -182,7 +92,7 @@ def write_description(description: Description, dialect: ExportDialect, token: s
     _interfaces(root, description, dialect)
     _units(root, {group.unit for group in description.layout.groups})
     categories = ET.SubElement(root, "LogCategories")
-    for name, text in LOG_CATEGORIES.items():
+    for name, text in _TABLES["log_categories"].items():
         ET.SubElement(categories, "Category", name=name, description=text)
     experiment = {
         "startTime": "0",
@@ -193,12 +103,8 @@ def write_description(description: Description, dialect: ExportDialect, token: s
     ET.SubElement(root, "DefaultExperiment", experiment)
     variables = ET.SubElement(root, "ModelVariables")
     structure = ET.SubElement(root, "ModelStructure")
-    if dialect.arrays:
-        _array_variables(variables, description)
-        _array_structure(structure, description, dialect)
-    else:
-        _scalar_variables(variables, description)
-        _scalar_structure(structure, description, dialect)
+    _variables(variables, description, dialect)
+    _structure(structure, description.layout, dialect)
     return xml_bytes(root)
 
 
@@ -243,13 +149,11 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
     Args:
         files: path relative to the manifest, role and description of each related CSV file.
     """
-    namespace = "http://fmi-standard.org/fmi-ls-manifest"
-    ET.register_namespace("fmi-ls", namespace)
     attributes = {
-        f"{{{namespace}}}fmi-ls-name": REFERENCES,
-        f"{{{namespace}}}fmi-ls-version": REFERENCES_VERSION,
-        f"{{{namespace}}}fmi-ls-description": "Layered Standard providing information on related files included in "
-        "an FMU.",
+        "xmlns:fmi-ls": "http://fmi-standard.org/fmi-ls-manifest",
+        "fmi-ls:fmi-ls-name": REFERENCES,
+        "fmi-ls:fmi-ls-version": REFERENCES_VERSION,
+        "fmi-ls:fmi-ls-description": "Layered Standard providing information on related files included in an FMU.",
     }
     root = ET.Element("fmiReferences", attributes)
     for source, role, text in files:
@@ -270,51 +174,42 @@ def _units(root: ET.Element, used: set[str]) -> None:
             ET.SubElement(unit, "DisplayUnit", name=DISPLAY_UNITS[name], factor=repr(180 / math.pi))
 
 
-def _scalar_variables(parent: ET.Element, description: Description) -> None:
-    """Add every number as a variable."""
+def _variables(parent: ET.Element, description: Description, dialect: ExportDialect) -> None:
+    """Add every group as a variable, and the time; or every number, where there are no arrays."""
     layout = description.layout
     for group in layout.groups:
         first = layout.offsets[group.name]
-        starts = _starts(group, description)
-        for k, name in enumerate(group.scalar_names()):
+        values = np.resize(description.start.get(group.name, np.zeros(1)), group.size)
+        starts = [repr(float(value)) for value in values]
+        pieces = {group.name: " ".join(starts)}
+        if not dialect.arrays:
+            pieces = dict(zip(group.scalar_names(), starts, strict=True))
+        for k, (name, start) in enumerate(pieces.items()):
+            identity = {"name": name, "valueReference": str(first + k), **ATTRIBUTES[group.role]}
+            identity["description"] = group.description
             number = _number(group)
             if group.role in STARTED:
-                number["start"] = starts[k]
+                number["start"] = start
             if group.role == DERIVATIVE:
-                # Variables are counted from 1 here.
-                number["derivative"] = str(_state_offset(group, layout) + k + 1)
-            variable = ET.SubElement(parent, "ScalarVariable", _identity(group, name, first + k))
-            ET.SubElement(variable, "Real", number)
-
-
-def _array_variables(parent: ET.Element, description: Description) -> None:
-    """Add every group as a variable, and the time."""
-    layout = description.layout
-    for group in layout.groups:
-        attributes = _identity(group, group.name, layout.offsets[group.name]) | _number(group)
-        if group.role in STARTED:
-            attributes["start"] = " ".join(_starts(group, description))
-        if group.role == DERIVATIVE:
-            attributes["derivative"] = str(_state_offset(group, layout))
-        variable = ET.SubElement(parent, "Float64", attributes)
-        for size in group.shape:
-            ET.SubElement(variable, "Dimension", start=str(size))
-    time = {
-        "name": "time",
-        "valueReference": str(layout.size),
-        "causality": "independent",
-        "variability": "continuous",
-        "unit": "s",
-        "description": "Simulation time.",
-    }
-    ET.SubElement(parent, "Float64", time)
-
-
-def _identity(group: Group, name: str, reference: int) -> dict[str, str]:
-    """Return name, value reference, role and description of a variable."""
-    attributes = {"name": name, "valueReference": str(reference), **ATTRIBUTES[group.role]}
-    attributes["description"] = group.description
-    return attributes
+                state = group.name.removeprefix("der(").removesuffix(")")
+                number["derivative"] = str(layout.offsets[state] + k + dialect.first_index)
+            if dialect.arrays:
+                variable = ET.SubElement(parent, "Float64", identity | number)
+                for size in group.shape:
+                    ET.SubElement(variable, "Dimension", start=str(size))
+            else:
+                variable = ET.SubElement(parent, "ScalarVariable", identity)
+                ET.SubElement(variable, "Real", number)
+    if dialect.arrays:
+        time = {
+            "name": "time",
+            "valueReference": str(layout.size),
+            "causality": "independent",
+            "variability": "continuous",
+            "unit": "s",
+            "description": "Simulation time.",
+        }
+        ET.SubElement(parent, "Float64", time)
 
 
 def _number(group: Group) -> dict[str, str]:
@@ -322,56 +217,48 @@ def _number(group: Group) -> dict[str, str]:
     attributes = {"unit": group.unit}
     if group.unit in DISPLAY_UNITS:
         attributes["displayUnit"] = DISPLAY_UNITS[group.unit]
-    if group.minimum is not None:
-        attributes["min"] = str(group.minimum)
-    if group.nominal is not None:
-        attributes["nominal"] = str(group.nominal)
-    return attributes
+    return attributes | dict(group.attributes)
 
 
-def _starts(group: Group, description: Description) -> list[str]:
-    """Return the start value of each number of a group."""
-    values = description.start.get(group.name)
-    if values is None:
-        return ["0.0"] * group.size
-    return [repr(float(value)) for value in values]
+def _structure(structure: ET.Element, layout: Layout, dialect: ExportDialect) -> None:
+    """Add the unknowns of every part of the model structure; without arrays, in a list for each part."""
+    for part, name in dialect.sections.items():
+        unknowns = layout.of_role(*UNKNOWNS[part])
+        parent = structure
+        element = name
+        if unknowns and not dialect.arrays:
+            parent = ET.SubElement(structure, name)
+            element = "Unknown"
+        for unknown in unknowns:
+            words = unknown.initially if part == INITIAL_UNKNOWNS else unknown.depends
+            for k, dependencies in enumerate(_dependencies(layout, unknown, words, dialect)):
+                index = layout.offsets[unknown.name] + k + dialect.first_index
+                attributes = {
+                    dialect.reference: str(index),
+                    "dependencies": " ".join(map(str, dependencies)),
+                    "dependenciesKind": " ".join(["dependent"] * len(dependencies)),
+                }
+                ET.SubElement(parent, element, attributes)
 
 
-def _state_offset(derivative: Group, layout: Layout) -> int:
-    """Return the offset of the state whose derivative a group is."""
-    return layout.offsets[derivative.name.removeprefix("der(").removesuffix(")")]
-
-
-def _scalar_structure(
-    structure: ET.Element, description: Description, dialect: ExportDialect
-) -> None:
-    """Add a list of unknowns for every part of the model structure."""
-    for section in description.sections:
-        if section.part in dialect.sections:
-            element = ET.SubElement(structure, dialect.sections[section.part])
-            for index, dependencies in section.scalars():
-                # Variables are counted from 1 here.
-                indices = [dependency + 1 for dependency in dependencies]
-                attributes = {"index": str(index + 1)} | _dependent(indices)
-                ET.SubElement(element, "Unknown", attributes)
-
-
-def _array_structure(
-    structure: ET.Element, description: Description, dialect: ExportDialect
-) -> None:
-    """Add the unknowns of every part of the model structure."""
-    for section in description.sections:
-        if section.part in dialect.sections:
-            for reference, dependencies in section.arrays():
-                attributes = {"valueReference": str(reference)} | _dependent(dependencies)
-                ET.SubElement(structure, dialect.sections[section.part], attributes)
-
-
-def _dependent(dependencies: list[int]) -> dict[str, str]:
-    return {
-        "dependencies": " ".join(map(str, dependencies)),
-        "dependenciesKind": " ".join(["dependent"] * len(dependencies)),
-    }
+def _dependencies(
+    layout: Layout, unknown: Group, words: Iterable[str], dialect: ExportDialect
+) -> Iterator[list[int]]:
+    """Yield the indices of what an unknown depends on: of an array as a whole, else of each of its numbers."""
+    groups = layout.dependencies(words)
+    firsts = [layout.offsets[group.name] + dialect.first_index for group in groups]
+    if dialect.arrays:
+        yield firsts
+        return
+    for k in range(unknown.size):
+        if unknown.elementwise:
+            yield [first + k for first in firsts]
+        else:
+            ranges = [
+                range(first, first + group.size)
+                for first, group in zip(firsts, groups, strict=True)
+            ]
+            yield [*chain.from_iterable(ranges)]
 
 
 def xml_bytes(root: ET.Element) -> bytes:

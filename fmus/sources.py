@@ -72,18 +72,16 @@ def layout_header(
         constants: further ones by name.
         token: GUID that the importer passes to `fmi2Instantiate` or `fmi3Instantiate…`.
     """
-    settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
-    zero = np.zeros(1)
-    groups: list[str] = []
+    groups = [f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups]
     values: list[str] = []
     for group in layout.groups:
-        groups.append(f"{{{layout.offsets[group.name]}, {group.size}}}")
-        group_values = np.resize(start.get(group.name, zero), group.size)
+        group_values = np.resize(start.get(group.name, np.zeros(1)), group.size)
         values += [float(value).hex() for value in group_values]
     minima: list[str] = []
-    for group in settable:
-        minimum = "-HUGE_VAL" if group.minimum is None else group.minimum.hex()
-        minima += [minimum] * group.size
+    for group in layout.of_role(PARAMETER, FIXED, INPUT, STATE):
+        minimum = dict(group.attributes).get("min")
+        bound = "-HUGE_VAL" if minimum is None else float(minimum).hex()
+        minima += [bound] * group.size
     macros: dict[str, object] = {
         "TOKEN": f'"{token}"',
         "N_GROUPS": len(layout.groups),

@@ -20,6 +20,7 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.kalman import (
+    Corrected,
     RandomWalk,
     RandomWalkEstimator,
     cholesky_of,
@@ -66,7 +67,7 @@ def corrected(
     feature_step: FloatArray,
     *,
     r: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form."""
     dq = joint_step[..., None, :]
     P = symmetric(joseph(P, np.matvec(P, dq), gain, dq, r[..., None]))
@@ -136,7 +137,7 @@ def fixed_point_update(
     r: FloatArray,
     weight: Callable[[FloatArray], FloatArray],
     config: MckfConfig | GmckfConfig,
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Correct by one motion with weights of measurement and prior that belong to the corrected estimate itself.
 
     With e = [B⁻¹ (J⁻ − J), (Δy − J Δq)/√r] the gain is that of the weights w(e), until J changes by less than the
@@ -246,7 +247,7 @@ def imcckf_update(
     *,
     r: FloatArray,
     bandwidth: float,
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     size = norm(innovation) / np.sqrt(r)
@@ -290,7 +291,7 @@ def rmckf_update(
     feature_step: FloatArray,
     r: FloatArray,
     config: RmckfConfig,
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     normalised = innovation / np.sqrt(r)[..., None]

@@ -93,6 +93,13 @@ def cholesky_of(P: FloatArray) -> FloatArray:
     return L
 
 
+Corrected: TypeAlias = tuple[FloatArray, FloatArray]
+"""Ĵ and its covariance after a motion."""
+Update: TypeAlias = Callable[..., Corrected]
+"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `kalman_update`; the
+shape of P depends on the filter, see `Covariance`."""
+
+
 def joseph(
     P: FloatArray, PH: FloatArray, K: FloatArray, joint_step: FloatArray, r: FloatArray
 ) -> FloatArray:
@@ -112,7 +119,7 @@ def symmetric(P: FloatArray) -> FloatArray:
 
 def kalman_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Correct vec(J) by one motion, as printed: K = P Hᵀ (H P Hᵀ + R)⁻¹, covariance in Joseph form.
 
     Args:
@@ -142,7 +149,7 @@ def kalman_update(
 
 def split_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Do the same where P = I_m ⊗ P_n: all rows of J share the gain K, (n,), and the covariance P_n, (..., n, n).
 
     K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
@@ -153,9 +160,6 @@ def split_update(
     return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(P)
 
 
-Update: TypeAlias = Callable[..., tuple[FloatArray, FloatArray]]
-"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `kalman_update`; the
-shape of P depends on the filter, see `Covariance`."""
 Covariance: TypeAlias = Literal["shared", "by_rows", "full"]
 """One P, (n, n), that all rows of J share; one of each row, (m, n, n); or one of all entries, (mn, mn)."""
 
@@ -270,7 +274,7 @@ def unscented_update(
     *,
     r: FloatArray,
     config: UkfConfig,
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Correct vec(J) by one motion with sigma points; see `kalman_update`.
 
     Args:
@@ -350,7 +354,7 @@ def rls_update(
     feature_step: FloatArray,
     *,
     forgetting: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+) -> Corrected:
     """Correct by one motion, P in Joseph form.
 
     Args:

@@ -26,6 +26,7 @@ from matplotlib.patches import Patch
 
 from page_studies.study import Study, Words, settings, sweep
 from servobench.harness.apps.figures import style
+from servobench.harness.apps.figures.style import COLOURS
 from servobench.harness.batch.results import load_runs
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import Sensing
@@ -34,8 +35,9 @@ from servobench.plant.robot.catalogue import find_robot
 LAW: Final = "pid"
 REFERENCE: Final = "true"
 ESTIMATORS: Final = {
-    "kalman": style.BLUE, "mckf": style.ORANGE, "imcckf": style.SKY, "gmckf": style.PURPLE, "rmckf": style.GREEN,
-    "robust": style.VERMILION, "constant": style.GREY, REFERENCE: style.BLACK,
+    "kalman": COLOURS["blue"], "mckf": COLOURS["orange"], "imcckf": COLOURS["sky"],
+    "gmckf": COLOURS["purple"], "rmckf": COLOURS["green"], "robust": COLOURS["vermilion"],
+    "constant": COLOURS["grey"], REFERENCE: COLOURS["black"],
 }  # fmt: skip
 """Those that are compared, with their colours: the Kalman filter, the correntropy filters, and two bounds."""
 GAIN: Final = 0.2  # [1/s]

@@ -8,9 +8,11 @@ used wherever numpy wants numbers.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.resources import files
 from itertools import count
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -292,41 +294,14 @@ def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> 
     return Traced.of(computed(JOIN, operands, (first,), detail), arranged.shape, kind)
 
 
-# C of numpy's ufuncs; functions that C does not have are in `linear_algebra.h`.
-ARITHMETIC: Mapping[str, str] = {
-    "add": "({} + {})", "subtract": "({} - {})", "multiply": "({} * {})", "divide": "({} / {})",
-    "power": "pow({}, {})", "negative": "(-{})", "positive": "{}", "absolute": "fabs({})", "fabs": "fabs({})",
-    "square": "square({})", "sqrt": "sqrt({})", "exp": "exp({})", "expm1": "expm1({})", "log": "log({})",
-    "log1p": "log1p({})", "sin": "sin({})", "cos": "cos({})", "tan": "tan({})", "arcsin": "asin({})",
-    "arccos": "acos({})", "arctan": "atan({})", "arctan2": "atan2({}, {})", "sinh": "sinh({})", "cosh": "cosh({})",
-    "tanh": "tanh({})", "hypot": "hypot({}, {})", "sign": "sign({})", "copysign": "copysign({}, {})",
-    "floor": "floor({})", "ceil": "ceil({})", "rint": "nearbyint({})", "maximum": "larger({}, {})",
-    "minimum": "smaller({}, {})", "remainder": "modulo({}, {})", "floor_divide": "floor({} / {})",
-    "reciprocal": "(1.0 / {})",
-}  # fmt: skip
-COMPARISONS: Mapping[str, str] = {
-    "less": "(double)({} < {})", "less_equal": "(double)({} <= {})", "greater": "(double)({} > {})",
-    "greater_equal": "(double)({} >= {})", "equal": "(double)({} == {})", "not_equal": "(double)({} != {})",
-    "logical_and": "(double)({} != 0.0 && {} != 0.0)", "logical_or": "(double)({} != 0.0 || {} != 0.0)",
-    "logical_not": "(double)({} == 0.0)", "isfinite": "(double)(fabs({}) <= DBL_MAX)",
-    "isnan": "(double)!(fabs({}) <= INFINITY)",
-}  # fmt: skip
+_TABLES = tomllib.loads(
+    (files("servobench.fmus.controllers") / "ufuncs.toml").read_text(encoding="utf-8")
+)
+ARITHMETIC: Mapping[str, str] = _TABLES["arithmetic"]
+COMPARISONS: Mapping[str, str] = _TABLES["comparisons"]
+LOGICAL_NAMES: Mapping[str, str] = _TABLES["logical_names"]
+EMPTY_REDUCTIONS: Mapping[str, float] = _TABLES["empty_reductions"]
 CHOICE = "({} != 0.0 ? {} : {})"
-# Operations on bits are logical ones on arrays of truth.
-LOGICAL_NAMES: Mapping[str, str] = {
-    "bitwise_and": "logical_and",
-    "bitwise_or": "logical_or",
-    "invert": "logical_not",
-}
-# The results of reductions over no entries.
-EMPTY_REDUCTIONS = {
-    "add": 0.0,
-    "multiply": 1.0,
-    "maximum": -np.inf,
-    "minimum": np.inf,
-    "logical_or": 0.0,
-    "logical_and": 1.0,
-}
 
 
 def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]:  # noqa: ANN401 - as numpy's

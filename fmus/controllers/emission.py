@@ -109,7 +109,6 @@ class Writer:
     positions: dict[Node, int] = field(default_factory=dict)  # in the order of the lines
     ends: dict[Block, int] = field(default_factory=dict)
     reads: dict[Node, list[Read]] = field(default_factory=lambda: defaultdict(list))
-    repeated: list[Block] = field(default_factory=list)  # loops around
     found: dict[Node, Entries] = field(default_factory=dict)  # where nodes are
     # All nodes that ever were in an array.
     residents: dict[str, list[Node]] = field(default_factory=lambda: defaultdict(list))

@@ -8,10 +8,10 @@ import numpy as np
 
 from servobench.fmus.controllers.branches import NOT_DEFINITE
 from servobench.fmus.controllers.record import Recorded
-from servobench.fmus.model_description import Description, sampled_sections
+from servobench.fmus.model_description import Description
 from servobench.fmus.product import Product, c_files, documentation, word
 from servobench.fmus.reference import tables
-from servobench.fmus.variables import INPUT, SAMPLED, Group, Layout
+from servobench.fmus.variables import SAMPLED, Group, Layout, read_groups
 from servobench.plant.contract.checks import FloatArray
 
 MODEL: Final = "controller"
@@ -34,38 +34,7 @@ def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]
         rows: of the reference.
         unit: of a feature.
     """
-    return (
-        Group(POSITION, (n,), INPUT, "rad", "Joint position as the encoders report it."),
-        Group(
-            FEATURE,
-            (m,),
-            INPUT,
-            unit,
-            "Measured feature; where it is missing, the last valid value.",
-        ),
-        Group(SEEN, (m,), INPUT, "1", "1 where the feature was measured for this instant, else 0."),
-        Group(
-            REFERENCE,
-            (rows, m),
-            INPUT,
-            unit,
-            "Desired feature now, in row 1, and at the next instants.",
-        ),
-        Group(
-            COMMAND,
-            (n,),
-            SAMPLED,
-            "rad/s",
-            "Joint velocity for the period that begins at this instant.",
-        ),
-        Group(
-            JACOBIAN,
-            (m, n),
-            SAMPLED,
-            f"{unit}/rad",
-            "Estimated Jacobian, 0 before there is one; for evaluation.",
-        ),
-    )
+    return read_groups(MODEL, {"n": n, "m": m, "rows": rows}, {"unit": unit})
 
 
 @dataclass(frozen=True)
@@ -106,7 +75,6 @@ class ControllerModel:
                 model_identifier=self.identifier,
                 summary=f"{self.name}: {self.summary}.",
                 layout=layout,
-                sections=sampled_sections(layout),
                 start=starts,
                 sources=c_files(fmi_version, CORE),
                 step=self.period,

@@ -111,7 +111,7 @@ class _Numpy:
     @staticmethod
     def full(shape: Any, value: Any, dtype: Any = None) -> Traced:  # noqa: ANN401 - as numpy's
         if isinstance(value, Traced):
-            return value.arranged(np.broadcast_to(value.places, shape)).copy()
+            return spread(value, shape).copy()
         return Traced.plain(np.full(shape, value, dtype=_real(dtype)))
 
     @staticmethod
@@ -122,8 +122,6 @@ class _Numpy:
 
     @staticmethod
     def broadcast_to(array: Any, shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
-        if isinstance(shape, int):
-            shape = (shape,)
         return spread(as_traced(array), shape)
 
 

@@ -49,28 +49,34 @@ def write_loop(
 
 def structure(products: Mapping[str, Product], stop: float) -> bytes:
     """Return the description of the system: components with the connectors in use, and the connections."""
-    ET.register_namespace("ssd", SSD)
-    ET.register_namespace("ssc", SSC)
-    attributes = {"name": "loop", "version": "1.0", "generationTool": exporter()}
-    root = ET.Element(f"{{{SSD}}}SystemStructureDescription", attributes)
+    root = ET.Element(
+        "ssd:SystemStructureDescription",
+        {
+            "xmlns:ssc": SSC,
+            "xmlns:ssd": SSD,
+            "name": "loop",
+            "version": "1.0",
+            "generationTool": exporter(),
+        },
+    )
     groups = {name: product.description.layout.by_name for name, product in products.items()}
     feature = BALL if BALL in groups[PLANT] else FEATURE
     measured = (("encoder_position", POSITION), (feature, FEATURE), (SEEN, SEEN))
     wires = [((PLANT, own), (CONTROLLER, wanted)) for own, wanted in measured]
     wires.append(((CONTROLLER, COMMAND), (PLANT, COMMAND)))
     ends = [(side, groups[side][name]) for start, end in wires for side, name in (start, end)]
-    system = ET.SubElement(root, f"{{{SSD}}}System", name="loop")
-    elements = ET.SubElement(system, f"{{{SSD}}}Elements")
+    system = ET.SubElement(root, "ssd:System", name="loop")
+    elements = ET.SubElement(system, "ssd:Elements")
     for side in products:
         source = {"source": f"resources/{side}.fmu", "type": "application/x-fmu-sharedlibrary"}
-        component = ET.SubElement(elements, f"{{{SSD}}}Component", {"name": side, **source})
-        connectors = ET.SubElement(component, f"{{{SSD}}}Connectors")
+        component = ET.SubElement(elements, "ssd:Component", {"name": side, **source})
+        connectors = ET.SubElement(component, "ssd:Connectors")
         for group in dict.fromkeys(group for own, group in ends if own == side):
             for scalar in group.scalar_names():
                 kind = "input" if group.role == INPUT else "output"
-                connector = ET.SubElement(connectors, f"{{{SSD}}}Connector", name=scalar, kind=kind)
-                ET.SubElement(connector, f"{{{SSC}}}Real", unit=group.unit)
-    connections = ET.SubElement(system, f"{{{SSD}}}Connections")
+                connector = ET.SubElement(connectors, "ssd:Connector", name=scalar, kind=kind)
+                ET.SubElement(connector, "ssc:Real", unit=group.unit)
+    connections = ET.SubElement(system, "ssd:Connections")
     for (start, first), (end, second) in wires:
         pairs = zip(
             groups[start][first].scalar_names(), groups[end][second].scalar_names(), strict=True
@@ -82,14 +88,10 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
                 "endElement": end,
                 "endConnector": other,
             }
-            ET.SubElement(connections, f"{{{SSD}}}Connection", names)
-    _units(root, {group.unit for _, group in ends})
-    ET.SubElement(root, f"{{{SSD}}}DefaultExperiment", startTime="0", stopTime=repr(stop))
+            ET.SubElement(connections, "ssd:Connection", names)
+    units = ET.SubElement(root, "ssd:Units")
+    for name in sorted({group.unit for _, group in ends}):
+        unit = ET.SubElement(units, "ssc:Unit", name=name)
+        ET.SubElement(unit, "ssc:BaseUnit", UNITS.get(name, {}))
+    ET.SubElement(root, "ssd:DefaultExperiment", startTime="0", stopTime=repr(stop))
     return xml_bytes(root)
-
-
-def _units(root: ET.Element, used: set[str]) -> None:
-    units = ET.SubElement(root, f"{{{SSD}}}Units")
-    for name in sorted(used):
-        unit = ET.SubElement(units, f"{{{SSC}}}Unit", name=name)
-        ET.SubElement(unit, f"{{{SSC}}}BaseUnit", UNITS.get(name, {}))

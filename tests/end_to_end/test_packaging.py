@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT / ".ci"))
 import release  # noqa: E402 - a script beside the package
 
 FOLDERS = ("plant", "controllers", "fmus", "harness")
-CODE = (".py", ".toml", ".c", ".h", ".j2", ".urdf", ".yaml")
+CODE = (".py", ".toml", ".c", ".h", ".j2", ".urdf", ".yaml", ".csv")
 
 
 @pytest.fixture(scope="module")

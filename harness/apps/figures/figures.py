@@ -1,6 +1,7 @@
 """All figures of a results folder, from its tables alone."""
 
 import textwrap
+import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -38,8 +39,8 @@ from servobench.harness.apps.figures.style import (
     save_figure,
 )
 from servobench.harness.apps.figures.tracks import (
-    Ensembles,
     Group,
+    Tasks,
     load_ensembles,
     load_groups,
     longest,
@@ -52,7 +53,6 @@ FOLDER = "figures"
 LETTERS = 15.0  # letters of a title in an inch
 TASKS_A_FIGURE = 4  # also blocks of paths
 FIRST = "first seed"
-OVER = "median and band over seeds"
 EACH = "each seed"
 
 
@@ -60,28 +60,12 @@ class Kind(NamedTuple):
     """A kind of figure, for `run`, the report and `figures` alike."""
 
     heading: str
-    seeds: str  # FIRST, OVER or EACH
+    seeds: str  # FIRST, EACH, or "median and band over seeds"
     in_page: bool = True  # whether the report shows it
 
 
-KINDS: Final = {
-    "conditions": Kind(
-        "Settled moves over each varied condition, all others together; bands are 95 % intervals",
-        EACH,
-    ),
-    "errors": Kind("Error of moves over time", OVER),
-    "features": Kind("Measured features of moves", FIRST, in_page=False),
-    "paths": Kind("True paths of moves, to scale", FIRST),
-    "tracking": Kind("Error along the curve, and in each feature", OVER),
-    "tracking_path": Kind("Desired and true path, to scale", FIRST),
-    "jacobian": Kind("Error of the estimated Jacobian", OVER),
-    "settling": Kind("Settling time of each run, and its error at the end", EACH),
-    "effort": Kind("Control effort and saturation of each run", EACH, in_page=False),
-    "smoothness": Kind("How smoothly each run drives the joints", EACH),
-    "own": Kind("Own metrics of each run", EACH),
-    "step_times": Kind("Step of the controller", EACH),
-    "joint_speeds": Kind("Commanded motion of the joints", FIRST, in_page=False),
-}
+_KINDS_FILE: Final = Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8")
+KINDS: Final = {name: Kind(**kind) for name, kind in tomllib.loads(_KINDS_FILE).items()}
 
 
 class NamedFigure(NamedTuple):
@@ -217,9 +201,7 @@ def _sample(kind: str, group: Group) -> str:
     return words
 
 
-def _plans(
-    group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int
-) -> Iterator[_Plan]:
+def _plans(group: Group, ensembles: Tasks, styles: Styles, size: int) -> Iterator[_Plan]:
     """Yield the figures of a group: of its moves, of its curves, and of both."""
     moves = {task: tracks for task, tracks in group.tasks.items() if longest(tracks).point_to_point}
     runs = group.runs

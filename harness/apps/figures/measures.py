@@ -19,7 +19,9 @@ from pandas.api.types import is_numeric_dtype
 from servobench.harness.analysis import comparison
 from servobench.harness.analysis.comparison import NO_ESTIMATE, Estimate
 from servobench.harness.apps.figures.style import (
+    BOX,
     LETTER,
+    MARKS_OF,
     TEXT,
     WIDE,
     Layout,
@@ -29,8 +31,9 @@ from servobench.harness.apps.figures.style import (
     label_rows,
     panel_grid,
     plain_logarithms,
+    write_inside,
 )
-from servobench.harness.apps.figures.tracks import Ensembles
+from servobench.harness.apps.figures.tracks import Tasks
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
@@ -47,8 +50,6 @@ NAME_LETTERS: Final = 20  # letters of a controller's name at an axis, for each 
 LETTERS: Final = 16.0  # letters of a label in an inch
 NUMBERS: Final = 0.25  # [in] next to the names
 MIN_ROWS: Final = 4  # controllers for which a panel has room
-# [1] Share of the distance between two places over which the marks of the methods are spread.
-SPREAD = 0.5
 UPPER: Final = 0.97  # [1] share of a panel's height at which the mark of an infinite value stands
 LINE_LETTERS: Final = 30  # letters of a line of text within a panel
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
@@ -135,9 +136,7 @@ def _short_name(name: str, layout: Layout) -> str:
     return f"…{name[1 - letters :]}"
 
 
-def draw_step_times(
-    tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE
-) -> Figure | None:
+def draw_step_times(tasks: Tasks, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values.
 
     Steps that take longer than the control period are marked and, on a wide sheet, counted.
@@ -165,12 +164,7 @@ def draw_step_times(
                 fontweight="bold" if too_slow else None,
                 linespacing=1.0,
             )
-    above: dict[str, Any] = {
-        "va": "bottom",
-        "fontsize": TEXT - 0.5,
-        "xytext": (0, 2),
-        "textcoords": "offset points",
-    }
+    above = {**MARKS_OF["above"], "fontsize": TEXT - 0.5}
     if layout.wide:
         axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", **above)
     if math.isfinite(limit):
@@ -188,7 +182,7 @@ def draw_step_times(
     return figure
 
 
-def _step_times(tasks: Mapping[str, Ensembles]) -> dict[str, FloatArray]:
+def _step_times(tasks: Tasks) -> dict[str, FloatArray]:
     """Return the times of all steps of each controller [ms] that has some."""
     parts: dict[str, list[FloatArray]] = {}
     for ensembles in tasks.values():
@@ -201,23 +195,20 @@ def _step_times(tasks: Mapping[str, Ensembles]) -> dict[str, FloatArray]:
 def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> str:
     """Draw the times of a controller's steps [ms] in line `i`, and return the numbers that belong beside it."""
     low, first, middle, third, high = np.percentile(values, PERCENTILES)
-    axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=7)
-    axes.plot(
-        [first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45
-    )
+    axes.plot([low, high], [i, i], color=style.colour, **MARKS_OF["range"])
+    axes.plot([first, third], [i, i], color=style.colour, **MARKS_OF["middle_half"])
     axes.plot(
         middle,
         i,
         color=style.colour,
         marker=style.marker or "o",
-        markersize=6.0,
-        markeredgecolor="black",
         markerfacecolor=style.face,
+        **MARKS_OF["middle"],
     )
     largest = values.max()
     words = ", ".join(_time_in_words(time) for time in (middle, high, largest))
     if largest > limit:
-        axes.plot(largest, i, color="black", marker="X", markersize=6.5, linestyle="")
+        axes.plot(largest, i, **MARKS_OF["too_slow"])
         words += f"\n{np.count_nonzero(values > limit)} of {len(values)} too slow"
     return words
 
@@ -261,16 +252,7 @@ def _draw_dots(
         values = values.where(_moves(runs) & ~never)
     if values.isna().all() and not never.any():
         axes.tick_params(axis="x", bottom=False, labelbottom=False)
-        axes.text(
-            0.5,
-            0.5,
-            "does not apply",
-            transform=axes.transAxes,
-            ha="center",
-            va="center",
-            color="0.4",
-            fontsize=TEXT - 1.0,
-        )
+        write_inside(axes, "does not apply", fontsize=TEXT - 1.0)
     edge = _limit(axes, values, NEVER if never.any() else 1.06)
     places = values.where(~never, edge)
     for i, name in enumerate(names):
@@ -287,36 +269,17 @@ def _draw_dots(
                 np.full(len(points), i),
                 color=style.colour,
                 marker=style.marker or "o",
-                linestyle="",
-                markersize=4.5,
                 markerfacecolor=style.colour if completed else "none",
-                markeredgewidth=0.7,
-                alpha=0.55,
-                clip_on=False,
+                **MARKS_OF["run"],
             )
         # A move that never settled counts in the median as one that settles after infinite time.
         judged = values[own].fillna(math.inf) if column == SETTLING else values[own]
         middle = judged.median()
         if own.sum() > 1 and math.isfinite(middle):
-            axes.plot(
-                middle,
-                i,
-                color="black",
-                marker="|",
-                markersize=9,
-                markeredgewidth=1.6,
-                linestyle="",
-            )
+            axes.plot(middle, i, **MARKS_OF["median"])
         if never[own].any():
-            axes.annotate(
-                f"{never[own].sum()} of {own.sum()}",
-                (edge, i),
-                ha="left",
-                va="center",
-                xytext=(5, 0),
-                textcoords="offset points",
-                fontsize=TEXT - 2.0,
-            )
+            words = f"{never[own].sum()} of {own.sum()}"
+            axes.annotate(words, (edge, i), fontsize=TEXT - 2.0, **MARKS_OF["never"])
 
 
 def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
@@ -335,14 +298,6 @@ def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
     return edge
 
 
-def _bounds(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the values of estimates and the ends of their intervals, (k,) each."""
-    y = np.array([estimate.value for estimate in estimates])
-    low = np.array([estimate.low for estimate in estimates])
-    high = np.array([estimate.high for estimate in estimates])
-    return y, low, high
-
-
 def draw_curves(
     axes: Axes, places: Sequence[float], values: Curves, styles: Styles, top: float
 ) -> None:
@@ -356,7 +311,8 @@ def draw_curves(
     for names in groups:
         first, *others = names
         style = styles[first]
-        y, low, high = _bounds(values[first])
+        bounds = [(estimate.value, estimate.low, estimate.high) for estimate in values[first]]
+        y, low, high = np.array(bounds).T
         known = ~np.isnan(y)
         if not known.any():
             continue
@@ -378,15 +334,8 @@ def _name_shared_line(axes: Axes, methods: str, y: FloatArray, top: float) -> No
     words = textwrap.fill(f"one line{constant}: {methods}", LINE_LETTERS)
     upper_half_free = float(np.nanmean(np.minimum(y, top))) < top / 2.0
     level, side = (0.96, "top") if upper_half_free else (0.04, "bottom")
-    axes.text(
-        0.03,
-        level,
-        words,
-        transform=axes.transAxes,
-        va=side,
-        fontsize=TEXT - 2.0,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
-    )
+    look = {"ha": "left", "va": side, "color": "black", "fontsize": TEXT - 2.0}
+    write_inside(axes, words, (0.03, level), bbox=BOX, **look)
 
 
 def same_curves(values: Curves) -> list[list[str]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from servobench.harness.apps.figures.style import (
     DESIRED,
     LETTER,
+    MARKS_OF,
     WIDE,
     Layout,
     Styles,
@@ -23,7 +23,7 @@ from servobench.harness.apps.figures.style import (
     mark_end,
     way_along,
 )
-from servobench.harness.apps.figures.tracks import Track, Tracks, label_of, longest
+from servobench.harness.apps.figures.tracks import Track, Tracks, TracksByTask, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
 COLUMNS: Final = 2
@@ -52,7 +52,7 @@ class View(NamedTuple):
     upright: int
 
 
-def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+def draw_paths(tasks: TracksByTask, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw the true paths of one run of each controller in two views, to scale; None with fewer than two features.
 
     Start, target and desired path are in black, an arrow shows in which direction a curve is followed.
@@ -90,7 +90,7 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     return figure
 
 
-def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[tuple[str, Tracks, _Extent]]:
+def _blocks(tasks: TracksByTask, views: list[View]) -> list[tuple[str, Tracks, _Extent]]:
     """Return title, tracks and extent of each task and division of methods; a task has the same extent in all."""
     blocks = []
     for task, whole in tasks.items():
@@ -174,12 +174,9 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
             if not track.completed:
                 mark_end(axes, points[:, 0], points[:, 1], styles[name])
     start = _points(whole, "true_feature_")[:1, chosen]
-    hollow: dict[str, Any] = {"color": "black", "markerfacecolor": "white", "linestyle": ""}
-    axes.plot(
-        *start.T, marker="s", markersize=6, markeredgewidth=1.3, label="start", zorder=10, **hollow
-    )
+    axes.plot(*start.T, **MARKS_OF["start"])
     if whole.point_to_point:
-        axes.plot(*reference[:1].T, marker="*", markersize=10, label="target", zorder=11, **hollow)
+        axes.plot(*reference[:1].T, **MARKS_OF["target"])
     labels = [CAMERA_FRAME.get(whole.features[i], label_of(whole.features[i])) for i in chosen]
     axes.set(xlabel=labels[0], ylabel=labels[1])
 
@@ -189,14 +186,7 @@ def _draw_direction(axes: Axes, reference: FloatArray) -> None:
     way = way_along(reference)
     tail, head = np.searchsorted(way, [ARROW * way[-1], 1.4 * ARROW * way[-1]])
     if tail < head < len(reference):
-        look = {
-            "arrowstyle": "-|>",
-            "color": "black",
-            "lw": 1.2,
-            "mutation_scale": 14,
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
+        look = MARKS_OF["direction"]
         axes.annotate("", reference[head], reference[tail], arrowprops=look, zorder=9)
 
 

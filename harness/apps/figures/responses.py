@@ -16,15 +16,18 @@ from operator import itemgetter
 from typing import Final
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import offset_copy
 
 from servobench.harness.analysis.comparison import handy_unit
 from servobench.harness.apps.figures.style import (
+    BOX,
     CAMERA_MOVES,
     DESIRED,
     JOINTS,
+    MARKS_OF,
     SETTLED,
     TEXT,
     WIDE,
@@ -37,6 +40,7 @@ from servobench.harness.apps.figures.style import (
     mark_end,
     panel_grid,
     plain_logarithms,
+    write_inside,
 )
 from servobench.harness.apps.figures.tracks import (
     BAND,
@@ -44,8 +48,10 @@ from servobench.harness.apps.figures.tracks import (
     Ensemble,
     Ensembles,
     Shown,
+    Tasks,
     Track,
     Tracks,
+    TracksByTask,
     label_of,
     longest,
     quantile,
@@ -73,7 +79,7 @@ OUTSIDE: Final = 1e12  # a number that is outside of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
 
 
-def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure:
+def draw_moves(tasks: Tasks, styles: Styles, layout: Layout = WIDE) -> Figure:
     """Draw the error of each task over time: median and band over seeds, and where runs settled (figure 4).
 
     Methods with aids and as published have panels of their own where there are both. The time ends when methods have
@@ -92,9 +98,7 @@ def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = 
     return figure
 
 
-def draw_jacobians(
-    tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE
-) -> Figure | None:
+def draw_jacobians(tasks: Tasks, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw how far the estimated Jacobian is from the true one, over seeds; None if no run knows it."""
     known: dict[str, Ensembles] = {}
     for task, ensembles in tasks.items():
@@ -108,7 +112,7 @@ def draw_jacobians(
 
 
 def draw_features(
-    tasks: Mapping[str, Tracks], until: Mapping[str, float], styles: Styles, layout: Layout = WIDE
+    tasks: TracksByTask, until: Mapping[str, float], styles: Styles, layout: Layout = WIDE
 ) -> Figure:
     """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
 
@@ -171,7 +175,7 @@ def draw_tracking(
 
 
 def _draw_tasks(
-    tasks: Mapping[str, Ensembles], styles: Styles, draw: DrawPanel, layout: Layout
+    tasks: Tasks, styles: Styles, draw: DrawPanel, layout: Layout
 ) -> tuple[Figure, list[tuple[Axes, str]]]:
     """Draw a panel for each task and division of methods; return the figure, and the panels with their tasks."""
     cells = []
@@ -193,12 +197,12 @@ def _draw_tasks(
     return figure, drawn
 
 
-def _features(tasks: Mapping[str, Tracks]) -> list[str]:
+def _features(tasks: TracksByTask) -> list[str]:
     """Return the names of the features in the order of the plant; those of the richest track count."""
     return max((track.features for tracks in tasks.values() for track in tracks.values()), key=len)
 
 
-def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
+def draw_error(axes: Axes, ensembles: Ensembles, styles: Styles) -> None:
     """Draw the true error over time: its median and band over seeds, logarithmic, and where runs settled."""
     first = next(iter(ensembles.values()))
     draw_over_seeds(axes, ensembles, styles, lambda ensemble: ensemble.shown_error)
@@ -232,7 +236,7 @@ def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
         axes.set_ylim(low if low > 0.0 else None, min(1.6 * largest, MAX_ERROR))
 
 
-def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
+def draw_jacobian(axes: Axes, ensembles: Ensembles, styles: Styles) -> None:
     """Draw the relative error of the estimated Jacobian over time, its median and band over seeds, logarithmic."""
     exact = [
         name
@@ -248,20 +252,12 @@ def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles)
     if any((values > 0.0).any() for values in drawn):
         plain_logarithms(axes)
     else:
-        axes.text(
-            0.5,
-            0.5,
-            "no values",
-            transform=axes.transAxes,
-            ha="center",
-            va="center",
-            color="0.4",
-        )
+        write_inside(axes, "no values")
 
 
 def draw_over_seeds(
     axes: Axes,
-    ensembles: Mapping[str, Ensemble],
+    ensembles: Ensembles,
     styles: Styles,
     curve: Callable[[Ensemble], FloatArray],
 ) -> None:
@@ -327,7 +323,7 @@ def mark_settling_band(axes: Axes, runs: Shown) -> None:
         )
 
 
-def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
+def _mark_settling_times(axes: Axes, ensembles: Ensembles, styles: Styles) -> None:
     """Mark below the settling band the median settling time of each controller; equal ones stand side by side."""
     near = NEAR * shown_until(ensembles)
     anchor = -math.inf
@@ -352,16 +348,14 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
         axes.plot(
             anchor,
             ensembles[name].settling_band,
-            marker="^",
             markersize=MARK_SIZE,
-            linestyle="",
             transform=place,
             color=style.colour,
             markeredgecolor=style.colour if style.hollow else "black",
             markeredgewidth=1.4 if style.hollow else 0.6,
             markerfacecolor=style.face,
-            zorder=11,
             gid=SETTLED,
+            **MARKS_OF["settled"],
         )
         beside += 1
 
@@ -386,17 +380,10 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
             _draw_joint(line, track, column, number)
         for axes, (_, metric, form) in zip(line, QUANTITIES, strict=True):
             value = track.row.get(metric)
-            known = value is not None and not np.isnan(value)
-            axes.text(
-                0.985,
-                0.93,
-                form.format(value) if known and layout.wide else "",
-                transform=axes.transAxes,
-                ha="right",
-                va="top",
-                fontsize=TEXT - 1.5,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0},
-            )
+            if layout.wide and pd.notna(value):
+                place = (0.985, 0.93)
+                look = {"ha": "right", "va": "top", "color": "black", "fontsize": TEXT - 1.5}
+                write_inside(axes, form.format(value), place, bbox=BOX, **look)
         line[0].set_ylabel(
             name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5
         )

@@ -5,11 +5,13 @@ import io
 import math
 import re
 import shutil
+import tomllib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -29,10 +31,10 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.units import split_quantity
 
-# Okabe and Ito's palette, distinguishable with every kind of colour vision.
-BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
-SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
-WINE, INDIGO = "#882255", "#332288"  # from Tol's palette, which goes with it
+_SHEET: Final = tomllib.loads(
+    (files("servobench.harness.apps.figures") / "style.toml").read_text(encoding="utf-8")
+)
+COLOURS: Final[dict[str, str]] = _SHEET["colours"]
 MARKS = 8  # markers on each line
 WIDTH = 7.2  # [in] width of a figure: both columns of a paper
 MAX_LINES = 7  # methods in a panel, not counting those that know the true robot
@@ -65,25 +67,24 @@ FEW_DECADES: Final = 50.0
 LETTER = 0.066  # [in] width of a letter of the legend
 SAMPLE = 0.55  # [in] width of the sample line of a legend
 MARGIN: Final = 0.2  # [in] on both sides of the legend
-DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
-# Colours and lines of joints in their order.
-JOINTS: Final = (
-    (BLUE, "-"),
-    (VERMILION, (0, (4, 1))),
-    (GREEN, "-."),
-    (ORANGE, (0, (6, 1, 1, 1))),
-    (PURPLE, (0, (2, 1))),
-    (SKY, "-"),
-    (BLACK, ":"),
-)
+DESIRED: Final[dict[str, Any]] = _SHEET["desired"]
+BOX: Final[dict[str, Any]] = _SHEET["box"]  # around words in a panel
+MARKS_OF: Final[dict[str, dict[str, Any]]] = _SHEET["marks"]
 DASHED = (0, (3.5, 1.5))  # line of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
-# Colours, lines and markers of unknown methods
-_OTHERS: Final[tuple[tuple[Any, ...], ...]] = (
-    (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN),
-    ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-."),
-    ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in ascii_lowercase)),
-)
+
+
+def _line(text: str) -> Any:  # noqa: ANN401 - matplotlib's own types
+    """Return a line style of matplotlib for its name, or for the lengths of dashes and gaps."""
+    if " " in text:
+        return 0, tuple(int(length) for length in text.split())
+    return text
+
+
+JOINTS: Final = [
+    (COLOURS[colour], _line(line))
+    for colour, line in zip(_SHEET["joints"]["colours"], _SHEET["joints"]["lines"], strict=True)
+]
 
 
 @dataclass(frozen=True)
@@ -148,11 +149,10 @@ class MethodStyle:
         return {
             "color": self.colour,
             "linestyle": self.line,
-            "linewidth": 1.2,
             "marker": self.marker,
-            "markersize": 4.0,
             "markerfacecolor": self.face,
             "markevery": (first, step),
+            **_SHEET["line"],
         }
 
     def path_arguments(self, points: FloatArray) -> dict[str, Any]:
@@ -171,19 +171,8 @@ def way_along(points: FloatArray) -> FloatArray:
 
 Styles = dict[str, MethodStyle]
 _STYLES = {
-    "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
-    "regression_mfac": MethodStyle(WINE, "-", "*"),
-    "calibrating_mfac": MethodStyle(INDIGO, "-", "H"),
-    "ukf_mfac": MethodStyle(BLUE, "-", "s"),
-    "ukf_mpc": MethodStyle(GREEN, "-", "^"),
-    "rbf_pid": MethodStyle(ORANGE, "-", "D"),
-    "calibrated": MethodStyle(BLACK, "-.", ""),
-    "nmpc_calibrated": MethodStyle(BLACK, ":", "x"),
-    "revealed": MethodStyle(GREY, "-.", "+"),
-    "constant": MethodStyle(GREY, ":", "v"),
-    "broyden": MethodStyle(PURPLE, "-", "P"),
-    "rls": MethodStyle(SKY, "-", "X"),
-    "cfdl_mfac": MethodStyle(YELLOW, "-", "p"),
+    name: MethodStyle(COLOURS[colour], line, marker)
+    for name, (colour, line, marker) in _SHEET["methods"].items()
 }
 _STYLES |= {
     name + PUBLISHED: replace(style, line=DASHED, hollow=True) for name, style in _STYLES.items()
@@ -248,16 +237,10 @@ def figure_style(size: float = FILM_TEXT) -> Iterator[None]:
         if name != "backend" and mpl.rcParams[name] != value
     }
     own: dict[Any, Any] = {
+        **_SHEET["rc"],
         "font.size": size,
         "axes.titlesize": size,
-        "axes.grid": True,
-        "grid.alpha": 0.3,
-        "axes.axisbelow": True,
-        "svg.fonttype": "none",
-        "svg.hashsalt": "servobench",
-        "pdf.fonttype": 42,
         "pgf.texsystem": next(filter(shutil.which, TEX), TEX[0]),
-        "pgf.rcfonts": False,
     }
     with mpl.rc_context({**changed_by_user, **own}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph ")  # the font lacks a letter of a name
@@ -299,20 +282,20 @@ def finish_columns(figure: Figure, panels: np.ndarray) -> None:
     add_legend(figure, panels.flat)
 
 
+def write_inside(
+    axes: Axes,
+    words: str,
+    place: tuple[float, float] = (0.5, 0.5),
+    **look: Any,  # noqa: ANN401 - as matplotlib's
+) -> None:
+    """Write words at a place of a panel, [1] of its width and height; in grey at its centre without another look."""
+    axes.text(*place, words, transform=axes.transAxes, **{**_SHEET["remark"], **look})
+
+
 def mark_end(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle) -> None:
     """Mark the last known point (x, y) of a run that ended early."""
     last = np.flatnonzero(np.isfinite(y))[-1]
-    axes.plot(
-        x[last],
-        y[last],
-        color=style.colour,
-        marker=END,
-        markersize=12,
-        markeredgewidth=2.0,
-        linestyle="",
-        zorder=12,
-        gid=ENDED,
-    )
+    axes.plot(x[last], y[last], color=style.colour, marker=END, gid=ENDED, **MARKS_OF["end"])
 
 
 def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
@@ -325,14 +308,7 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     groups = {line.get_gid() for axes in panels for line in axes.get_lines()}
     for gid, marker in ((SETTLED, "^"), (ENDED, END)):
         if gid in groups:
-            entries[gid] = mpl.lines.Line2D(
-                [],
-                [],
-                color="0.3",
-                marker=marker,
-                markersize=7,
-                linestyle="",
-            )
+            entries[gid] = mpl.lines.Line2D([], [], marker=marker, **MARKS_OF["legend"])
     entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))
     if not entries:
         return
@@ -344,12 +320,9 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     figure.legend(
         list(entries.values()),
         labels,
-        loc="outside lower center",
-        frameon=False,
         fontsize=TEXT - 0.5,
         ncols=max(1, min(fitting, len(entries))),
-        handlelength=2.6,
-        columnspacing=1.2,
+        **_SHEET["legend"],
     )
 
 
@@ -483,4 +456,9 @@ def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[
 
 def _other(index: int) -> MethodStyle:
     """Return the style of an unknown method; the first 32 differ in their markers."""
-    return MethodStyle(*(known[index % len(known)] for known in _OTHERS))
+    known = _SHEET["unknown_methods"]
+    markers = [*known["markers"], *(f"${letter}$" for letter in ascii_lowercase)]
+    colour, line, marker = (
+        values[index % len(values)] for values in (known["colours"], known["lines"], markers)
+    )
+    return MethodStyle(COLOURS[colour], _line(line), marker)

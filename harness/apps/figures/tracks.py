@@ -95,11 +95,14 @@ class Track(Shown):
         """Whether the run has too many rows to draw them one by one."""
         return len(self.table) > LONG
 
+    @property
+    def step(self) -> int:
+        """Number of rows for which one row of an overview stands."""
+        return len(self.table) // OVERVIEW if self.long else 1
+
     def overview(self) -> Self:
         """Return the track with few rows; errors are root mean squares over all rows for which one stands."""
-        if not self.long:
-            return self
-        return self.thinned(len(self.table) // OVERVIEW)
+        return self.thinned(self.step)
 
     def thinned(self, step: int) -> Self:
         """Return the track with every `step`-th row, which has the root mean square of errors over these rows."""
@@ -141,6 +144,7 @@ class Track(Shown):
 
 
 Tracks = dict[str, Track]
+TracksByTask = Mapping[str, Tracks]
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +255,7 @@ class Ensemble(Shown):
 
 
 Ensembles = dict[str, Ensemble]
+Tasks = Mapping[str, Ensembles]
 
 
 def quantile(values: FloatArray, share: float) -> FloatArray:
@@ -266,7 +271,7 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
 
 def load_ensembles(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Ensembles]:
     """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
-    camera_moves_at = _camera_move(folder.configuration)
+    moves_at = folder.configuration.get("run", {}).get("camera_moves_at")
     tracks: dict[tuple[str, str], list[Track]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
         key = track.row["task"], track.row["controller"]
@@ -275,20 +280,12 @@ def load_ensembles(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Ensem
     never = unbegun.groupby(["task", "controller"]).size()
     ensembles: dict[str, Ensembles] = {}
     for (task, name), own in tracks.items():
-        ensemble = _ensemble(own, int(never.get((task, name), 0)), camera_moves_at)
+        ensemble = _ensemble(own, int(never.get((task, name), 0)), moves_at)
         ensembles.setdefault(task, {})[name] = ensemble
     return ensembles
 
 
-def _camera_move(configuration: Mapping[str, Mapping[str, Any]]) -> float:
-    """Return after which share of a run the camera moves, by the settings of a folder; NaN without one."""
-    share = configuration.get("run", {}).get("camera_moves_at")
-    if isinstance(share, int | float) and 0.0 <= share < 1.0:
-        return share
-    return math.nan
-
-
-def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
+def shown_until(ensembles: Ensembles) -> float:
     """Return until when a figure shows these runs [s]: a move until well after the slowest method has settled."""
     each = list(ensembles.values())
     end = max(float(ensemble.time[-1]) for ensemble in each)
@@ -300,13 +297,12 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
     return min(end, max(MARGIN * max(known), MIN_SHARE * end))
 
 
-def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> Ensemble:
+def _ensemble(tracks: Sequence[Track], never: int, moves_at: object) -> Ensemble:
     """Return the ensemble of tracks and of runs that never began; a camera moves after that share of a run."""
     runs = pd.DataFrame([track.row for track in tracks])
     longest_track = max(tracks, key=lambda track: len(track.table))
     # All runs of an ensemble are thinned alike, so that they have common instants.
-    step = len(longest_track.table) // OVERVIEW if longest_track.long else 1
-    few = [track.thinned(step) for track in tracks]
+    few = [track.thinned(longest_track.step) for track in tracks]
     time = max((track.time for track in few), key=len)
 
     def padded(values: FloatArray, filling: float) -> FloatArray:
@@ -329,13 +325,13 @@ def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> En
         step_time=step_times[step_times > 0.0],
         settling_time=float(np.median(settled_after)),
         mostly_ended=bool(ended_early / (len(runs) + never) >= BAND[1]),
-        camera_moved_at=_camera_moved_at(runs, longest_track, camera_moves_at),
+        camera_moved_at=_camera_moved_at(runs, longest_track, moves_at),
     )
 
 
-def _camera_moved_at(runs: pd.DataFrame, longest: Track, share: float) -> float:
+def _camera_moved_at(runs: pd.DataFrame, longest: Track, share: object) -> float:
     """Return when the camera was moved [s], after a share of the longest run; NaN where it was not."""
     moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
-    if not moves or math.isnan(share):
+    if not moves or not isinstance(share, int | float) or not 0.0 <= share < 1.0:
         return math.nan
     return float(longest.time[int(share * len(longest.time))])

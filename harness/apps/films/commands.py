@@ -96,19 +96,21 @@ def record(
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import engine_of, rendered_plant
 
-    film = out if out is not None and out.suffix.removeprefix(".") in (MP4, GIF) else None
-    if film is None and out is not None and out.suffix[1:].isalpha() and not out.is_dir():
+    into = out or (folder or Path("results")) / RECORDINGS
+    ending = into.suffix.removeprefix(".")
+    film = out if ending in (MP4, GIF) else None
+    if film is not None:
+        if kinds not in (selection.ALL, ending):
+            raise ConfigurationError(
+                f"--out {film} names one film; leave --kinds {kinds} away, or name a folder"
+            )
+        kinds = ending
+        into = film.parent
+    elif out is not None and ending.isalpha() and not out.is_dir():
         raise ConfigurationError(
             f"--out {out} must be a folder, or one film that ends in .{MP4} or .{GIF}"
         )
-    if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
-        raise ConfigurationError(
-            f"--out {film} names one film; leave --kinds {kinds} away, or name a folder"
-        )
-    wanted = selection.split_names(
-        "kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS
-    )
-    into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
+    wanted = selection.split_names("kinds", kinds, KINDS)
     _check_writable(into)
     with telling(console, "reading" if folder else "running") as tell:
         shown = _shown(folder, run, new)

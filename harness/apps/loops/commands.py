@@ -115,10 +115,10 @@ def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
 
     rows = []
     for warm in map(warm_up, runs):
-        loop = SmallLoop(warm) if isinstance(warm.controller, ServoController) else None
-        rows.append(
-            (float("nan"), float("nan"))
-            if loop is None
-            else (loop.gain_limit(), loop.latency_limit())
-        )
-    return pd.DataFrame(rows, columns=["simulated_gain_margin", "simulated_latency_limit_s"])
+        row = {"simulated_gain_margin": float("nan"), "simulated_latency_limit_s": float("nan")}
+        if isinstance(warm.controller, ServoController):
+            loop = SmallLoop(warm)
+            row["simulated_gain_margin"] = loop.gain_limit()
+            row["simulated_latency_limit_s"] = loop.latency_limit()
+        rows.append(row)
+    return pd.DataFrame(rows)

@@ -26,7 +26,7 @@ from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.harness.apps.loops.systems import ArmModel, StateSpace
 from servobench.harness.config.settings import flatten
 from servobench.harness.run.experiment import build
-from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
+from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray
@@ -435,33 +435,16 @@ class SmallLoop:
         sensing = replace(quiet, latency=round(late, TIME_DIGITS))
         setup = PlantSetup(self._warm.model, rest.joint_position, self._period)
         plant = build_kinematic(replace(self._warm.plant, sensing=sensing), setup)
-        length = LoopSettings(round(DURATION / self._period) + 1, rest.preview)
-        rows = length.periods + rest.preview
-        desired = np.broadcast_to(rest.feature + offset, (rows, len(rest.feature)))
-        controller = _FrozenController(self._servo, self._state, rest, factor)
-        rollout = Rollout(plant, plant.reset(0), desired, length)
-        features = np.array([period.truth.feature for period in periods(rollout, controller)])
+        reference = rest.reference(rest.feature + offset)
+        observation = plant.reset(0)
+        state = self._state
+        features = []
+        for _ in range(round(DURATION / self._period)):
+            measured = rest.observation(
+                observation.feature, observation.joint_position, observation.time
+            )
+            state, u = self._servo.step(state, measured, reference)
+            observation = plant.step(Command(factor * u))
+            features.append(plant.truth().feature)
         plant.close()
-        return features[1:]
-
-
-@final
-class _FrozenController(Controller):
-    """A frozen servo after its rest, whose command is multiplied by a factor."""
-
-    def __init__(self, servo: Servo, state: ServoState, rest: Rest, factor: float) -> None:
-        self._servo = servo
-        self._state = state
-        self._rest = rest
-        self._factor = factor
-
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Keep the state of the rest."""
-
-    def step(self, observation: Observation, reference: FloatArray) -> Command:
-        """See `Controller.step`."""
-        measured = self._rest.observation(
-            observation.feature, observation.joint_position, observation.time
-        )
-        self._state, u = self._servo.step(self._state, measured, reference)
-        return Command(self._factor * u)
+        return np.array(features)

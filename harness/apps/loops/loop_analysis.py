@@ -13,7 +13,7 @@ feedforward of it does not pass for feedback. Adaptation in the small motions is
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, NamedTuple, TypeAlias, final
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,6 @@ from servobench.harness.apps.loops.equilibrium import (
     TASK,
     Rest,
     Source,
-    Warm,
     at_rest,
     linearise,
     warm_up,
@@ -44,15 +43,13 @@ from servobench.harness.apps.loops.systems import (
     largest_gain,
     sensitivity,
 )
-from servobench.harness.run.loop import LoopSettings, Rollout, periods
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.tasks import fitted
-from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ControllerDiverged, RunFault
 from servobench.plant.contract.lanes import one_thread
-from servobench.plant.contract.signals import Command, Observation, Truth
+from servobench.plant.contract.signals import Observation
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.mismatch import Mismatch
@@ -94,72 +91,6 @@ class Record(NamedTuple):
     command: FloatArray  # (periods, n) [rad/s]
 
 
-@final
-class LinearArm(Plant):
-    """The linear arm around a rest, as a plant whose measurements can be excited.
-
-    Attributes:
-        measured: deviations of features and joint positions since `excite`, one (m + n,) a period.
-    """
-
-    def __init__(self, arm: ArmModel, rest: Rest) -> None:
-        """Begin at the rest."""
-        self._system = arm.matrices()
-        self._period = arm.period
-        self._rest = rest
-        self._m = len(arm.jacobian)
-        self._x = np.zeros(len(self._system.A))
-        self._k = 0
-
-    def excite(self, added: FloatArray) -> Observation:
-        """Add signals to the measurements from now on, (periods, m + n) m and rad, and return the present observation.
-
-        Raises:
-            ControllerDiverged: the loop is not stable.
-        """
-        self._added = added
-        self.measured: list[FloatArray] = []
-        return self._observe()
-
-    def reset(self, seed: int) -> Observation:
-        """Measure without excitation; nothing is random. See `Plant.reset`."""
-        return self.excite(np.zeros((0, len(self._system.C))))
-
-    def step(self, command: Command) -> Observation:
-        """See `Plant.step`.
-
-        Raises:
-            ControllerDiverged: the loop is not stable.
-        """
-        self._x = self._system.A @ self._x + self._system.B @ command.joint_velocity
-        self._k += 1
-        return self._observe()
-
-    def truth(self) -> Truth:
-        """See `Plant.truth`."""
-        deviation = self._system.C @ self._x
-        return Truth(self._rest.feature + deviation[: self._m], None)
-
-    def close(self) -> None:
-        """See `Plant.close`; nothing is held."""
-
-    def _observe(self) -> Observation:
-        m = self._m
-        rest = self._rest
-        deviation = self._system.C @ self._x
-        row = len(self.measured)
-        if row < len(self._added):
-            deviation = deviation + self._added[row]
-            if not np.abs(deviation[:m]).max() < MAX_MOTION:  # NaN counts as unstable, too
-                raise ControllerDiverged(
-                    f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions"
-                )
-            self.measured.append(deviation)
-        time = rest.time + self._k * self._period
-        joint_position = rest.joint_position + deviation[m:]
-        return Observation(time, joint_position, rest.feature + deviation[:m])
-
-
 class SmallMotions:
     """A controller in closed loop with the linear arm around a rest."""
 
@@ -171,8 +102,11 @@ class SmallMotions:
         """
         self._controller = controller
         self._rest = rest
-        self._arm = LinearArm(arm, rest)
-        self.run(np.zeros((SETTLING, sum(arm.jacobian.shape))))
+        self._system = arm.matrices()
+        self._period = arm.period
+        self._x = np.zeros(len(self._system.A))
+        self._k = 0
+        self.run(np.zeros((SETTLING, len(self._system.C))))
 
     def run(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
         """Go on with signals added to the measurements, (periods, m + n).
@@ -184,21 +118,37 @@ class SmallMotions:
         Raises:
             ControllerDiverged: the loop is not stable.
         """
-        wanted = self._rest.feature
-        if desired is not None:
-            wanted = wanted + desired
-        length = LoopSettings(len(added), self._rest.preview)
-        rows = np.tile(wanted, (len(added) + self._rest.preview + 1, 1))
-        rollout = Rollout(self._arm, self._arm.excite(added), rows, length)
-        command = [period.command.joint_velocity for period in periods(rollout, self._controller)]
-        return Record(np.array(self._arm.measured), np.array(command))
+        rest = self._rest
+        m = len(rest.feature)
+        wanted = rest.feature if desired is None else rest.feature + desired
+        reference = rest.reference(wanted)
+        measured = []
+        commands = []
+        for row in added:
+            deviation = self._system.C @ self._x + row
+            if not np.abs(deviation[:m]).max() < MAX_MOTION:  # NaN counts as unstable, too
+                raise ControllerDiverged(
+                    f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions"
+                )
+            time = rest.time + self._k * self._period
+            joint_position = rest.joint_position + deviation[m:]
+            observation = Observation(time, joint_position, rest.feature + deviation[:m])
+            u = self._controller.step(observation, reference).joint_velocity
+            self._x = self._system.A @ self._x + self._system.B @ u
+            self._k += 1
+            measured.append(deviation)
+            commands.append(u)
+        return Record(np.array(measured), np.array(commands))
 
     def tried(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
         """Return the record of `run`, and restore the state from before it."""
-        controller, arm = self._controller.save(), self._arm.save()
+        before = self._controller.save()
+        x = self._x
+        k = self._k
         record = self.run(added, desired)
-        self._controller.restore(controller)
-        self._arm.restore(arm)
+        self._controller.restore(before)
+        self._x = x
+        self._k = k
         return record
 
 
@@ -325,45 +275,24 @@ def analyse_loop(
     """
     with one_thread():
         warm = warm_up(resolved)
-        name = resolved.request.controller
+        arm = warm.arm
+        m, n = arm.jacobian.shape
+        steps = round(STEP_DURATION / arm.period)
         if isinstance(warm.controller, ServoController) and not identify:
-            return _linearised(name, warm, source)
-        return _identified(name, warm)
-
-
-def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
-    """Return the loop of a composed controller, linearised with a frozen estimator."""
-    arm = warm.arm
-    controller = linearise(*at_rest(warm, source))
-    closed = closed_loop(arm.matrices(), controller)
-    response = linear_response(controller, arm)
-    steps = round(STEP_DURATION / arm.period)
-    return LoopAnalysis(
-        name=name,
-        model="linearised",
-        stable=is_stable(closed.A),
-        margins=response.margins(),
-        response=response,
-        step=closed.step(len(arm.jacobian), arm.period, steps),
-    )
-
-
-def _identified(name: str, warm: Warm) -> LoopAnalysis:
-    """Return the loop of any controller, identified from logged data."""
-    arm = warm.arm
-    m, n = arm.jacobian.shape
-    loop = SmallMotions(warm.controller, arm, warm.rest)
-    frequency, controller = controller_response(excite(loop, m + n), arm.period)
-    response = LoopResponse(frequency, controller, arm)
-    steps = round(STEP_DURATION / arm.period)
-    return LoopAnalysis(
-        name=name,
-        model="identified",
-        stable=True,  # an unstable one has ended the experiments
-        margins=response.margins(),
-        response=response,
-        step=step_responses(loop, m, n, steps),
-    )
+            model = "linearised"
+            controller = linearise(*at_rest(warm, source))
+            closed = closed_loop(arm.matrices(), controller)
+            stable = is_stable(closed.A)
+            response = linear_response(controller, arm)
+            step = closed.step(m, arm.period, steps)
+        else:
+            model = "identified"
+            loop = SmallMotions(warm.controller, arm, warm.rest)
+            stable = True  # an unstable one has ended the experiments
+            response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)
+            step = step_responses(loop, m, n, steps)
+        name = resolved.request.controller
+        return LoopAnalysis(name, model, stable, response.margins(), response, step)
 
 
 def delay_margin(

@@ -1,6 +1,7 @@
 """Pictures of analysed loops: Bode, Nyquist, sensitivity, step, limits of gain over latency; and a page of them."""
 
 import math
+import tomllib
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -9,7 +10,6 @@ from string import Template
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.apps.figures.style import (
@@ -32,14 +32,16 @@ LATENCIES: FloatArray = np.linspace(0.0, 0.5, 21)  # [s]
 FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # [1] factors on the command
 # [1] M_s at the edges of the colours; above 2 a loop is hardly robust.
 PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)
-NYQUIST_REACH = 2.5  # [1] length of the negative axes of a Nyquist plot
 COLUMNS = 3
+SHEET = tomllib.loads(Path(__file__).with_name("pictures.toml").read_text(encoding="utf-8"))
+LINES = SHEET["lines"]
 
 
 def draw_loops(loops: Sequence[LoopAnalysis]) -> Figure:
     """Draw the loops side by side."""
     figure = Figure(figsize=(11.0, 6.6), layout="constrained")
-    (magnitude, nyquist, peaks), (phase, step, limits) = figure.subplots(2, 3)
+    panels = figure.subplots(2, 3).ravel()
+    magnitude, nyquist, peaks, phase, step, limits = panels
     styles = method_styles([loop.name for loop in loops])
     for loop in loops:
         style = styles[loop.name]
@@ -61,18 +63,18 @@ def draw_loops(loops: Sequence[LoopAnalysis]) -> Figure:
             loop.gain_limits(LATENCIES.tolist()),
             **style.line_arguments(len(LATENCIES)),
         )
-    _finish_frequencies(magnitude, phase, peaks)
-    _finish_nyquist(nyquist)
-    step.set(title="Step of the reference", xlabel="time [s]", ylabel="feature", ylim=(-0.05, 1.6))
-    limits.axhline(1.0, color="0.4", linewidth=0.9)
-    limits.axvline(1000.0 * loops[0].arm.latency, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
-    limits.set(
-        title="Gain margin",
-        xlabel="latency of the camera [ms]",
-        ylabel="factor on command",
-        ylim=(0.3, 20.0),
-    )
-    plain_logarithms(limits)
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    nyquist.plot(np.cos(angle), np.sin(angle), **LINES["unit_circle"])
+    nyquist.plot(-1.0, 0.0, **LINES["critical"])
+    magnitude.axhline(1.0, **LINES["usual"])
+    phase.axhline(-180.0, **LINES["usual"])
+    limits.axhline(1.0, **LINES["usual"])
+    latency = 1000.0 * loops[0].arm.latency
+    limits.axvline(latency, linestyle=(0, (2, 2)), **LINES["usual"])
+    for axes, settings in zip(panels, SHEET["panels"].values(), strict=True):
+        axes.set(**settings)
+    for axes in (magnitude, peaks, limits):
+        plain_logarithms(axes)
     add_legend(figure, [magnitude])
     return figure
 
@@ -93,22 +95,10 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
             FACTORS,
             np.where(unstable, np.nan, peaks),
             norm=norm,
-            cmap="viridis_r",
-            shading="nearest",
-            rasterized=True,
+            **SHEET["map"],
         )
         axes.plot(1000.0 * LATENCIES, limits, color="black", linewidth=1.4)
-        # The cross marks the loop as it is: its own latency, the command as computed.
-        axes.plot(
-            1000.0 * loop.arm.latency,
-            1.0,
-            color="white",
-            marker="X",
-            markersize=9,
-            markeredgecolor="black",
-            clip_on=False,
-            zorder=10,
-        )
+        axes.plot(1000.0 * loop.arm.latency, 1.0, **LINES["present"])
         axes.set(title=loop.name, ylim=(FACTORS[0], FACTORS[-1]))
         axes.set(xlabel="latency of the camera [ms]", ylabel="factor on the command")
         axes.label_outer()
@@ -116,7 +106,9 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
         plain_logarithms(axes)
     for axes in grid.flat[len(loops) :]:
         axes.set_axis_off()
-    figure.colorbar(mpl.cm.ScalarMappable(norm, "viridis_r"), ax=grid, label="M_s", format="%g")
+    figure.colorbar(
+        mpl.cm.ScalarMappable(norm, SHEET["map"]["cmap"]), ax=grid, label="M_s", format="%g"
+    )
     return figure
 
 
@@ -155,36 +147,3 @@ def _falling_phase(curve: FloatArray) -> FloatArray:
     """Return the phase of a locus without jumps, [°], that begins between −270 and 90."""
     phase = np.rad2deg(np.unwrap(np.angle(curve)))
     return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
-
-
-def _finish_frequencies(magnitude: Axes, phase: Axes, peaks: Axes) -> None:
-    for axes in (magnitude, phase, peaks):
-        axes.set(xscale="log", xlabel="frequency [rad/s]")
-    magnitude.set(title="Open loop L", ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
-    magnitude.axhline(1.0, color="0.4", linewidth=0.9)
-    plain_logarithms(magnitude)
-    phase.set(
-        title="Open loop L",
-        ylabel="phase of the loci of L [°]",
-        ylim=(-540.0, 0.0),
-        yticks=range(-540, 1, 90),
-    )
-    phase.axhline(-180.0, color="0.4", linewidth=0.9)
-    peaks.set(
-        title="Sensitivity S = (I + L)⁻¹", ylabel="largest singular value of S", ylim=(0.03, 5.0)
-    )
-    plain_logarithms(peaks)
-
-
-def _finish_nyquist(axes: Axes) -> None:
-    angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    axes.plot(np.cos(angle), np.sin(angle), color="0.6", linewidth=0.9)
-    axes.plot(-1.0, 0.0, color="black", marker="+", markersize=11, markeredgewidth=1.6)
-    axes.set(
-        title="Nyquist plot of L",
-        xlabel="real part of the loci of L",
-        ylabel="imaginary part",
-        aspect="equal",
-        xlim=(-NYQUIST_REACH, 1.0),
-        ylim=(-NYQUIST_REACH, 1.0),
-    )

@@ -81,10 +81,8 @@ def closed_loop(plant: StateSpace, controller: StateSpace) -> StateSpace:
     """
     measured = len(plant.C)
     # The controller's inputs are the measured signals and then the references.
-    B_y = controller.B[:, :measured]
-    B_r = controller.B[:, measured:]
-    D_y = controller.D[:, :measured]
-    D_r = controller.D[:, measured:]
+    B_y, B_r = np.split(controller.B, [measured], axis=1)
+    D_y, D_r = np.split(controller.D, [measured], axis=1)
     by_plant = D_y @ plant.C  # u from the plant's states
     plant_rows = [plant.A + plant.B @ by_plant, plant.B @ controller.C]
     controller_rows = [B_y @ plant.C, controller.A]
@@ -212,32 +210,26 @@ class LoopResponse:
     controller: ComplexArray  # from the measured feature and joint positions to the command, (k, n, m + n) [rad/s]
     arm: ArmModel  # linear model of arm and camera
 
-    @property
-    def z(self) -> ComplexArray:
-        """e^{jω dt}, (k,)."""
-        return np.asarray(np.exp(1j * self.frequency * self.arm.period))
-
     def at_command(self) -> ComplexArray:
         """Return L broken at the command, (k, n, n)."""
-        J = self.arm.jacobian
-        m = len(J)
-        exposed, joints = self.arm.response(self.z)
-        from_feature = self.controller[:, :, :m]
-        from_joints = self.controller[:, :, m:]
-        by_feature = exposed[:, None, None] * (from_feature @ J)
-        by_joints = joints[:, None, None] * from_joints
-        return -by_feature - by_joints
+        from_feature, from_joints = self._paths()
+        return -(from_feature @ self.arm.jacobian) - from_joints
 
     def at_feature(self) -> ComplexArray:
         """Return L broken at the measured feature, (k, m, m), with the joint positions fed back."""
-        J = self.arm.jacobian
-        m, n = J.shape
-        exposed, joints = self.arm.response(self.z)
-        from_feature = self.controller[:, :, :m]
-        from_joints = self.controller[:, :, m:]
-        inner = np.eye(n) - joints[:, None, None] * from_joints  # the loop over joint positions
+        from_feature, from_joints = self._paths()
+        inner = np.eye(from_joints.shape[-1]) - from_joints  # the loop over joint positions
         command = np.linalg.solve(inner, from_feature)
-        return np.asarray(-exposed[:, None, None] * (J @ command))
+        return np.asarray(-(self.arm.jacobian @ command))
+
+    def _paths(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return the controller's response times a joint's, from feature (k, n, m) and joint positions (k, n, n)."""
+        m = len(self.arm.jacobian)
+        z = np.asarray(np.exp(1j * self.frequency * self.arm.period))
+        exposed, joints = self.arm.response(z)
+        from_feature = exposed[:, None, None] * self.controller[:, :, :m]
+        from_joints = joints[:, None, None] * self.controller[:, :, m:]
+        return from_feature, from_joints
 
     def margins(self) -> Margins:
         """Return the margins: of the gain at the command, of the rest at the measured feature."""
@@ -309,16 +301,28 @@ def loci(L: ComplexArray) -> ComplexArray:
     return np.asarray(values)
 
 
+class Crossings(NamedTuple):
+    """Where loci change the sign of a level between two frequencies."""
+
+    row: npt.NDArray[np.intp]  # index of the frequency before, (crossings,)
+    before: ComplexArray  # locus at that frequency
+    after: ComplexArray  # locus at the next one
+    share: FloatArray  # part of the way between both, after which the level is 0
+
+
+def _crossings(values: ComplexArray, level: FloatArray) -> Crossings:
+    """Return where loci (k, c) change the sign of their level (k, c), which is taken as linear in between."""
+    crosses = np.sign(level[:-1]) != np.sign(level[1:])
+    low = level[:-1][crosses]
+    high = level[1:][crosses]
+    row, _ = np.nonzero(crosses)
+    return Crossings(row, values[:-1][crosses], values[1:][crosses], low / (low - high))
+
+
 def gain_crossings(L: ComplexArray) -> FloatArray:
     """Return the factors at which a locus passes −1, (crossings,)."""
     values = _relevant(loci(L))
-    imag = values.imag
-    changes_sign = np.sign(imag[:-1]) != np.sign(imag[1:])
-    crosses = changes_sign & (imag[:-1] != imag[1:])
-    before = values[:-1][crosses]
-    after = values[1:][crosses]
-    # The locus is a straight line between two frequencies: it crosses the real axis after this share of it.
-    share = before.imag / (before.imag - after.imag)
+    _, before, after, share = _crossings(values, values.imag)
     real = before.real + share * (after.real - before.real)
     last = values[-1]  # at the Nyquist frequency the loci are real
     ends = last.real[np.abs(last.imag) <= NEGLIGIBLE_LOCUS * np.abs(last)]
@@ -329,17 +333,10 @@ def gain_crossings(L: ComplexArray) -> FloatArray:
 def phase_crossings(L: ComplexArray, frequency: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return where loci cross the unit circle: arg λ + π in [0, 2π) [rad] and ω [rad/s], (crossings,) each."""
     values = _relevant(loci(L))
-    level = np.log(np.abs(values))
-    crosses = np.sign(level[:-1]) != np.sign(level[1:])
-    level_before = level[:-1][crosses]
-    level_after = level[1:][crosses]
     # Between two frequencies log |λ|, arg λ and log ω are taken as linear.
-    share = level_before / (level_before - level_after)
-    before = values[:-1][crosses]
-    after = values[1:][crosses]
+    row, before, after, share = _crossings(values, np.log(np.abs(values)))
     turn = np.angle(after / before)
     phase = np.mod(np.angle(before) + share * turn + np.pi, 2.0 * np.pi)
-    row, _ = np.nonzero(crosses)
     ratio = frequency[row + 1] / frequency[row]
     where = frequency[row] * ratio**share
     return phase, where

@@ -100,7 +100,7 @@ class Answer:
 
     claim: str  # its number; readings of the paper have a name instead
     statement: str  # the claim in a few words
-    plant: str  # the plant on which the claim was tested
+    plant: str  # the plant on which the claim was tested; `answer_all` fills it in
     verdict: str  # reproduced, not reproduced, or the cases on which it depends
     evidence: str  # one line
     measurements: tuple[Measurement, ...]  # the numbers, for the table and the figure
@@ -164,27 +164,19 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
     own = {}
     for name, table in tables.items():
         here = table[table["plant"] == plant].reset_index(drop=True)
-        own[name] = here.replace({"controller": plain})
-    for name, table in own.items():
-        if not (table["status"] == COMPLETED).any():
+        if not (here["status"] == COMPLETED).any():
             raise ConfigurationError(f"no run of {name} on {plant} reached its last period")
+        own[name] = here.replace({"controller": plain})
+    claims = (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)
+    answers = [claim(own) for claim in claims]
     printed = "reading: both step sizes without ε, as printed"
+    answers.append(_reading(own, NO_EPSILON, "ε = 0", printed))
     by_entry = "reading: controller network fitted entry by entry"
-    answers = [
-        _faster(own, plant),
-        _overshoot_and_path(own, plant),
-        _alike(own, plant),
-        _leaving(own, plant),
-        _circle(own, plant),
-        _cheaper(own, plant),
-        _keeps_up(own, plant),
-        _reading(own, plant, NO_EPSILON, "ε = 0", printed),
-        _reading(own, plant, ENTRIES, "entries", by_entry),
-    ]
-    return [replace(answer, division=division) for answer in answers]
+    answers.append(_reading(own, ENTRIES, "entries", by_entry))
+    return [replace(answer, plant=plant, division=division) for answer in answers]
 
 
-def _faster(tables: Tables, plant: str) -> Answer:
+def _faster(tables: Tables) -> Answer:
     panel = "settling time, proposed − rival, mean, s"
     compared = pairings(tables[MAIN], "settling_time_s", panel, "better")
     middles = medians(tables[MAIN], "settling time, median, s")
@@ -193,7 +185,7 @@ def _faster(tables: Tables, plant: str) -> Answer:
         times = [f"{m.label} {_time_in_words(m)}" for m in middles if m.place == task]
         words.append(f"{task} {', '.join(times)}")
     evidence = f"faster in {held(compared)} of {len(compared)} pairings; medians {'; '.join(words)}"
-    return answer("1", "converges faster than the other three", plant, compared, evidence, middles)
+    return answer("1", "converges faster than the other three", compared, evidence, middles)
 
 
 def _time_in_words(measurement: Measurement) -> str:
@@ -204,17 +196,17 @@ def _time_in_words(measurement: Measurement) -> str:
     return "never"
 
 
-def _overshoot_and_path(tables: Tables, plant: str) -> Answer:
+def _overshoot_and_path(tables: Tables) -> Answer:
     runs = tables[MAIN]
     over = pairings(runs, "overshoot", "overshoot, proposed − rival, mean, %", "worse", 100.0)
     path = pairings(runs, "path_length_ratio", "path ratio, proposed − rival, mean", "worse")
     larger = f"larger overshoot in {held(over)} of {len(over)} pairings"
     longer = f"longer path in {held(path)} of {len(path)}"
     statement = "its overshoot is larger and its path longer"
-    return answer("2", statement, plant, [*over, *path], f"{larger}, {longer}")
+    return answer("2", statement, [*over, *path], f"{larger}, {longer}")
 
 
-def _alike(tables: Tables, plant: str) -> Answer:
+def _alike(tables: Tables) -> Answer:
     runs = tables[MAIN]
     panel = "settling time, ukf_mpc − ukf_mfac, mean, s"
     small = margin("settling_time_s", runs)
@@ -226,10 +218,10 @@ def _alike(tables: Tables, plant: str) -> Answer:
     differences = ", ".join(f"{m.place} {m.estimate:.2f} s" for m in measured)
     circle = " against ".join(f"{m.estimate:.1f} mm ({m.label})" for m in laps)
     evidence = f"{differences}; circle {circle}"
-    return answer("3", "UKF+MPC and UKF+MFAC behave alike", plant, measured, evidence, laps)
+    return answer("3", "UKF+MPC and UKF+MFAC behave alike", measured, evidence, laps)
 
 
-def _leaving(tables: Tables, plant: str) -> Answer:
+def _leaving(tables: Tables) -> Answer:
     runs = tables[MAIN].assign(time=settling_times(tables[MAIN]).fillna(DURATION))
     cost = _mean_times(runs, LEAVING) - _mean_times(runs, STAYING)  # [s]
     panel = "extra settling time where the region is left, mean, s"
@@ -240,7 +232,7 @@ def _leaving(tables: Tables, plant: str) -> Answer:
         measured.append(judged(panel, "exp1, exp4", costs, small, "worse"))
     evidence = "; ".join(f"{m.label} {m.estimate:.2f} s" for m in measured)
     statement = "outside the region both RBF methods suffer, the proposed more"
-    return answer("4", statement, plant, measured, evidence)
+    return answer("4", statement, measured, evidence)
 
 
 def _mean_times(runs: pd.DataFrame, tasks: Sequence[str]) -> pd.DataFrame:
@@ -248,7 +240,7 @@ def _mean_times(runs: pd.DataFrame, tasks: Sequence[str]) -> pd.DataFrame:
     return runs[runs["task"].isin(tasks)].pivot_table("time", "seed", "controller")
 
 
-def _circle(tables: Tables, plant: str) -> Answer:
+def _circle(tables: Tables) -> Answer:
     measured = [circle_error(tables[MAIN], name) for name in (PROPOSED, *OTHERS)]
     laps = tables[MAIN][tables[MAIN]["task"] == CIRCLE]
     followed = (laps["rms_error_evaluated"] <= MAX_CIRCLE_ERROR) & (laps["status"] == COMPLETED)
@@ -263,10 +255,10 @@ def _circle(tables: Tables, plant: str) -> Answer:
     share = Measurement("within 10 mm RMS, share", CIRCLE, PROPOSED, rate, holds)
     words = ", ".join(f"{m.label} {m.estimate:.1f} mm ({lost[m.label]} lost)" for m in measured)
     evidence = f"within 10 mm in {good} of {len(own)}; medians {words}"
-    return answer("5", "tracks a circle of 0.3 m radius", plant, [share], evidence, measured)
+    return answer("5", "tracks a circle of 0.3 m radius", [share], evidence, measured)
 
 
-def _cheaper(tables: Tables, plant: str) -> Answer:
+def _cheaper(tables: Tables) -> Answer:
     panel = f"step time, proposed over {MPC}"
     every = tables[TIMED]
     measured = []
@@ -279,7 +271,7 @@ def _cheaper(tables: Tables, plant: str) -> Answer:
     words = ", ".join(f"{_ratio_in_words(m.estimate.value)} {m.place}" for m in measured)
     evidence = f"its median step is {words} (a factor of {CLEAR_RATIO:g} counts; the ratios are in measurements.csv)"
     statement = "its update costs less time than an optimising MPC"
-    return answer("6", statement, plant, measured, evidence)
+    return answer("6", statement, measured, evidence)
 
 
 def _ratio_in_words(ratio: float) -> str:
@@ -291,7 +283,7 @@ def _ratio_in_words(ratio: float) -> str:
     return "about as long as that of ukf_mpc in"
 
 
-def _keeps_up(tables: Tables, plant: str) -> Answer:
+def _keeps_up(tables: Tables) -> Answer:
     """Compare errors on the robots that ran with frozen learning as well; rendered, these are fewer."""
     frozen = _jacobian_errors(tables[FROZEN])
     online = _jacobian_errors(tables[MAIN]).reindex(frozen.index)
@@ -310,7 +302,7 @@ def _keeps_up(tables: Tables, plant: str) -> Answer:
         words.append(f"{task} {' / '.join(middles)} %")
     evidence = f"median error online / as trained: {', '.join(words)}"
     statement = "its estimator keeps up with the true Jacobian"
-    return answer("7", statement, plant, measured, evidence, levels)
+    return answer("7", statement, measured, evidence, levels)
 
 
 def _jacobian_errors(runs: pd.DataFrame) -> pd.Series[float]:
@@ -319,7 +311,7 @@ def _jacobian_errors(runs: pd.DataFrame) -> pd.Series[float]:
     return own["jacobian_error_mean"].where(own["status"] == COMPLETED)
 
 
-def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) -> Answer:
+def _reading(tables: Tables, name: str, label: str, statement: str) -> Answer:
     """Compare the proposed method in another reading of the paper with the one that is the default here."""
     runs = tables[MAIN]
     other = tables[name]
@@ -338,7 +330,7 @@ def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) 
     first, second = _times_of_moves(other).align(_times_of_moves(usual), join="inner")
     found = paired_difference(first, second, margin("settling_time_s", usual))
     words.append(f"mean difference {found.mean:+.2f} s, lost {found.lost[0]} : {found.lost[1]}")
-    return Answer(label, statement, plant, found.verdict, "; ".join(words), tuple(measured))
+    return Answer(label, statement, "", found.verdict, "; ".join(words), tuple(measured))
 
 
 def _times_of_moves(runs: pd.DataFrame) -> pd.Series[float]:
@@ -411,9 +403,7 @@ def held(cases: Cases) -> int:
     return sum(bool(m.holds) for m in cases)
 
 
-def answer(
-    claim: str, statement: str, plant: str, cases: Cases, evidence: str, further: Cases = ()
-) -> Answer:
+def answer(claim: str, statement: str, cases: Cases, evidence: str, further: Cases = ()) -> Answer:
     """Return the answer whose verdict follows from the cases judged; `further` measurements are for the figure."""
     count = held(cases)
     decided = sum(m.holds is not None for m in cases)
@@ -425,4 +415,4 @@ def answer(
         verdict = NOT_REPRODUCED
     else:
         verdict = f"{DEPENDS}: holds in {count} of {decided}"
-    return Answer(claim, statement, plant, verdict, evidence, (*cases, *further))
+    return Answer(claim, statement, "", verdict, evidence, (*cases, *further))

@@ -4,11 +4,13 @@ Every method gets the same robots, starts and targets at every place of the map.
 take longer, so that there is time to recover. The usual map has the axes `LINES`; a user names others.
 """
 
+import csv
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -56,50 +58,26 @@ class Line:
     axis: str  # an axis of the mismatch, the sensor's among them, or "latency" or "noise"
     title: str  # label of the axis
     places: tuple[Magnitude, ...]  # its magnitudes
+    usual: bool = False  # whether it belongs to the usual map
 
 
-LINES: Final = (
-    Line(
-        "camera_rotation", "camera turned [°]", parse_magnitudes("camera_rotation", "0:180:30deg")
-    ),
-    Line("links", "link lengths wrong by up to [%]", parse_magnitudes("links", "0:30:10%")),
-    Line(
-        "joint_offsets",
-        "joint zeros wrong by up to [°]",
-        parse_magnitudes("joint_offsets", "0:20:5deg"),
-    ),
-    Line("tool", "tool wrong by up to [mm]", parse_magnitudes("tool", "0:100:25mm")),
-    Line(LATENCY, "camera latency [ms]", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
-    Line(
-        NOISE,
-        "sensor noise [times the usual]",
-        tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8)),
-    ),
-    Line(MOVE, "camera moved half-way [°]", parse_magnitudes(MOVE, "0:180:45deg")),
-)
-SENSOR_LINES: Final = (
-    Line("mixture", "noise displaced to one side [%]", parse_magnitudes("mixture", "0:20:5%")),
-    Line("bimodal", "noise displaced to either side [%]", parse_magnitudes("bimodal", "0:20:5%")),
-    Line("stable", "exponent of stable noise", parse_magnitudes("stable", "1:2:0.25")),
-    Line("uniform", "uniform noise, deviation [mm]", parse_magnitudes("uniform", "0/1/2/4/8mm")),
-    Line("quantised", "feature rounded to [mm]", parse_magnitudes("quantised", "0/1/2/5/10mm")),
-    Line("outliers", "frames that are outliers [%]", parse_magnitudes("outliers", "0:40:10%")),
-    Line(
-        "occlusions",
-        "frames with the feature hidden [%]",
-        parse_magnitudes("occlusions", "0:40:10%"),
-    ),
-    Line("lost_frames", "frames lost [%]", parse_magnitudes("lost_frames", "0:80:20%")),
-    Line(
-        "frame_period", "time between frames [ms]", parse_magnitudes("frame_period", "50:200:50ms")
-    ),
-    Line("jitter", "frames late by up to [ms]", parse_magnitudes("jitter", "0:200:50ms")),
-    Line(
-        "latency_swing", "latency swinging by [ms]", parse_magnitudes("latency_swing", "0:200:50ms")
-    ),
-    Line("camera_turn", "camera turning by [°/s]", parse_magnitudes("camera_turn", "0:15:5deg")),
-)
-KNOWN_LINES: Final = {line.axis: line for line in (*LINES, *SENSOR_LINES)}
+def _read_lines() -> dict[str, Line]:
+    """Return the axes of `lines.csv` by name."""
+    table = (files("servobench.harness.apps.studies") / "lines.csv").read_text(encoding="utf-8")
+    lines = {}
+    for row in csv.DictReader(table.splitlines()):
+        axis = row["axis"]
+        if axis in (LATENCY, NOISE):
+            numbers = map(float, row["places"].split("/"))
+            places = tuple(Magnitude(number, row["unit"]) for number in numbers)
+        else:
+            places = parse_magnitudes(axis, row["places"])
+        lines[axis] = Line(axis, row["title"], places, row["usual"] == "yes")
+    return lines
+
+
+KNOWN_LINES: Final = _read_lines()
+LINES: Final = tuple(line for line in KNOWN_LINES.values() if line.usual)
 
 
 def find_lines(axes: Sequence[str]) -> tuple[Line, ...]:

@@ -23,10 +23,11 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 """
 
 import math
+import tomllib
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
+from importlib.resources import files
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -52,113 +53,51 @@ Point: TypeAlias = Mapping[str, Any]
 DIGITS: Final = 3  # significant digits of a tuned number; no study is more precise
 EDGE: Final = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
 WIDER: Final = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
-LIMITS: Final[Mapping[str, float]] = {
-    "law.horizon": 10,  # the preview has no more steps,
-    "law.horizon_time": 0.5,  # and is no longer
-    "law.k": 1.9,  # below 2, from which on these two diverge
-    "estimator.k2": 1.9,
-    "estimator.step_factor": 1.0,  # bounds of the classes; of cfdl_mfac the box ends beside the bound
-    "estimator.initial_covariance": 100.0,
-}
+_TABLES: Final = tomllib.loads(
+    (files("servobench.harness.apps.tuning") / "spaces.toml").read_text(encoding="utf-8")
+)
+LIMITS: Final[Mapping[str, float]] = _TABLES["limits"]
 """Upper ends of boxes that are no choice; a lower end of 0, or of one step, is none either."""
 
-_log: Final = partial(FloatDistribution, log=True)
-_SWITCH: Final = CategoricalDistribution((False, True))
-_AIDS: Final[Space] = {
-    **{
+
+def _aids() -> dict[str, Distribution]:
+    """Return the boxes of the aids, as they are declared."""
+    boxes: dict[str, Any] = {
         f"aids.{name}": CategoricalDistribution(aid.tuned)  # type: ignore[arg-type]
         for name, aid in SWITCHES.items()
         if aid.tuned
-    },
-    **{
-        f"aids.{name}": FloatDistribution(each.low, each.high, log=each.log)
-        for name, each in RANGES.items()
-    },
-}
-_P: Final[Space] = {
-    "law.proportional_gain": _log(0.5, 30.0),  # 1/s
-    "law.damping": _log(0.002, 0.2),  # m/rad
-}
-_PI: Final[Space] = {**_P, "law.integral_gain": FloatDistribution(0.0, 3.0)}  # 1/s²
-_PID: Final[Space] = {**_PI, "law.derivative_gain": FloatDistribution(0.0, 0.5)}
-_MFAC: Final[Space] = {
-    "law.gain": _log(0.6, 40.0),  # 1/s
-    "law.step_weight": _log(1e-4, 0.2),  # m²/rad²
-}
-_MPC: Final[Space] = {
-    "law.decay": _log(0.6, 40.0),  # 1/s
-    "law.move_weight": _log(0.001, 1.0),  # m²/rad²
-    "law.horizon_time": FloatDistribution(0.2, 0.5, step=0.05),  # s, at most the preview
-}
-_RBFNN: Final[Space] = {
-    "law.k": _log(0.01, 1.0),
-    "law.epsilon": _log(1e-5, 1e-1),  # m⁴
-    "law.horizon": IntDistribution(3, 10),  # steps of 0.05 s, at most the preview
-    "training.controller.gain": FloatDistribution(
-        2.0, 5.0, step=1.0
-    ),  # 1/s; each value is a training of its own
-}
-_RBF: Final[Space] = {
-    "estimator.k2": _log(0.05, 1.8),
-    "estimator.epsilon": _log(1e-5, 1e-2),  # rad²
-}
-_LYAPUNOV: Final[Space] = {
-    "estimator.n2": _log(1e-4, 0.2),  # 1/(m s)
-    "estimator.n3": _log(1e-3, 2.0),  # 1/m
-}
-_UKF: Final[Space] = {
-    "estimator.walk": _log(0.004, 1.5),  # m/rad/√rad
-    "estimator.initial_deviation": _log(0.005, 0.5),  # m/rad
-}
-_BROYDEN: Final[Space] = {
-    "estimator.step_factor": _log(0.02, 1.0),
-    "estimator.min_joint_step": _log(0.001, 0.05),  # rad
-}
-_RLS: Final[Space] = {
-    "estimator.memory": _log(0.2, 20.0),  # s
-    "estimator.initial_covariance": _log(0.5, 100.0),  # 1/rad²; the class bounds it by 100
-}
-_CFDL: Final[Space] = {
-    "estimator.reset": _SWITCH,
-    "estimator.step_factor": FloatDistribution(0.05, 1.9),
-    "estimator.regularisation": _log(1e-5, 0.1),  # rad²
-}
-_MPC_AIDS: Final = {
-    key: each for key, each in _AIDS.items() if key not in ("aids.feedforward", "aids.limit")
-}
-_ARM_AIDS: Final = {key: each for key, each in _AIDS.items() if key != "aids.model"}
-_MPC_SWITCHES: Final[Space] = {
-    "law.mode": CategoricalDistribution(("constant", "moves")),
-    "law.use_preview": _SWITCH,
-}
-_START: Final[Space] = {"initial.source": CategoricalDistribution(("nominal", "probe"))}
-_RBFNN_SWITCHES: Final[Space] = {
-    "law.offset_free": _SWITCH,
-    "law.preview": _SWITCH,
-    "law.row_space_only": _SWITCH,
-    "law.anti_windup": _SWITCH,
-}
+    }
+    for name, each in RANGES.items():
+        boxes[f"aids.{name}"] = FloatDistribution(each.low, each.high, log=each.log)
+    return boxes
 
-SPACES: Final[Mapping[str, Space]] = {
-    "rbfnn_mfac": {**_AIDS, **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
-    "rbfnn_mfac:published": {**_RBFNN, **_RBF},
-    "regression_mfac": {**_AIDS, **_MFAC},
-    "calibrating_mfac": {**_ARM_AIDS, **_MFAC},
-    "ukf_mfac": {**_AIDS, **_START, **_MFAC, **_UKF},
-    "ukf_mfac:published": {**_MFAC, **_UKF},
-    "ukf_mpc": {**_MPC_AIDS, **_START, **_MPC_SWITCHES, **_MPC, **_UKF},
-    "ukf_mpc:published": {**_MPC, **_UKF},
-    "rbf_pid": {**_AIDS, **_PID, **_LYAPUNOV},
-    "rbf_pid:published": {**_P, **_LYAPUNOV},
-    "constant": _PI,
-    "calibrated": _PI,
-    "broyden": {**_AIDS, **_START, **_PID, **_BROYDEN},
-    "broyden:published": {**_P, **_BROYDEN},
-    "rls": {**_AIDS, **_START, **_PID, **_RLS},
-    "rls:published": {**_P, **_RLS},
-    "cfdl_mfac": {**_AIDS, **_START, **_MFAC, **_CFDL},
-    "cfdl_mfac:published": {**_MFAC, **_CFDL},
-}
+
+def _spaces() -> dict[str, Space]:
+    """Return the search space of each method by its name."""
+    parts = {"aids": _aids()}
+    for part, boxes in _TABLES["parts"].items():
+        parts[part] = {key: _box(given) for key, given in boxes.items()}
+    spaces: dict[str, Space] = {}
+    for name, method in _TABLES["methods"].items():
+        space: dict[str, Distribution] = {}
+        for part in method["parts"]:
+            space |= parts[part]
+        for key in method.get("without", ()):
+            del space[key]
+        spaces[name] = space
+    return spaces
+
+
+def _box(given: Any) -> Distribution:  # noqa: ANN401 - a table or a list of TOML
+    """Return the box of a range, of whole numbers where its ends are such, or of choices."""
+    if isinstance(given, list):
+        return CategoricalDistribution(given)
+    if isinstance(given["low"], int):
+        return IntDistribution(**given)
+    return FloatDistribution(**given)
+
+
+SPACES: Final[Mapping[str, Space]] = _spaces()
 
 
 def choose_tunable(word: str) -> str:
@@ -423,9 +362,7 @@ def _step(distribution: FloatDistribution | IntDistribution, value: float, sign:
     size = STEP * abs(value) or STEP_FROM_ZERO * distribution.high
     if distribution.step is not None:
         size = distribution.step * max(1, round(size / distribution.step))
-    moved = min(max(value + sign * size, distribution.low), distribution.high)
-    if isinstance(distribution, IntDistribution):
-        return int(moved)
+    moved: float = _within(distribution, value + sign * size, value)
     return moved
 
 
