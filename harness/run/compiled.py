@@ -110,7 +110,7 @@ class CompiledState(NamedTuple):
     """The state of a controller in C."""
 
     x: FloatArray  # (..., states)
-    jacobian: FloatArray  # of the last step, (..., m, n) [unit of the feature/rad]; NaN before
+    jacobian: FloatArray  # in the last step, (..., m, n) [unit of the feature/rad]; NaN before
 
 
 @final
