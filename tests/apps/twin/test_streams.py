@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 import pytest
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -330,3 +331,63 @@ def test_a_log_and_two_streams_are_not_given_together(tmp_path, refusal_of):
     words = ("identify", "--joints", joints, "--features", features, "--columns", columns)
     assert "is the log itself; name another file" in refusal_of(*words, "--out", features)
     assert "--joints is in place of a log and --run" in refusal_of(*words, "--run", "a")
+
+
+def with_commands(folder, stamps):
+    """Write a bag with joints, features, and commands that were recorded at stamps [s]; joints come twice."""
+    bag = write_bag(folder, seconds=5.0)
+    kinds = {}
+    with (
+        AnyReader([bag], default_typestore=STORE) as old,
+        Writer(folder / "more", version=9) as new,
+    ):
+        for connection in old.connections:
+            kind = connection.msgtype
+            kinds[connection.topic] = new.add_connection(connection.topic, kind, typestore=STORE)
+        for connection, time, raw in old.messages():
+            for late in (0, 1_000_000) if connection.topic == "/joint_states" else (0,):
+                new.write(kinds[connection.topic], time + late, raw)
+        kind = "std_msgs/msg/Float64MultiArray"
+        topic = new.add_connection("/forward_velocity_controller/commands", kind, typestore=STORE)
+        layout = TYPES["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+        for number, stamp in enumerate(stamps):
+            message = TYPES[kind](layout=layout, data=np.full(6, float(number)))
+            new.write(topic, START + round(1e9 * stamp), STORE.serialize_cdr(message, kind))
+    return folder / "more"
+
+
+def test_repeated_messages_count_once_and_commands_hold_until_the_next(tmp_path):
+    bag = with_commands(tmp_path, [0.5, 1.0, 2.0])
+    whole = read(bag, bag, None)
+    assert whole.resolved.run.period == pytest.approx(PERIOD, rel=5e-3)
+    found = whole.table["joint_velocity_command_elbow_rad_s"]
+    assert sorted(set(found)) == [0.0, 1.0, 2.0]
+    assert found.iloc[-1] == 2.0
+
+
+def test_a_broken_stream_of_commands_is_named_and_left_out(tmp_path, caplog):
+    bag = with_commands(tmp_path, [0.5, 0.5, 1.0])
+    whole = read(bag, bag, None)
+    assert not any(name.startswith("joint_velocity_command") for name in whole.table)
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert "commands of" in said
+    assert "stamp 1 of 3 is not later than the one before" in said
+    assert said.endswith("commands are left out")
+    columns = tmp_path / "map.toml"
+    columns.write_text('[commands]\nunit = "s"\ntopic = "/forward_velocity_controller/commands"\n')
+    with pytest.raises(ConfigurationError, match="commands of .* stamp 1 of 3"):
+        read(bag, bag, columns)
+
+
+def test_a_log_without_commands_says_nothing_and_positions_are_none(tmp_path, caplog):
+    bag = write_bag(tmp_path, seconds=3.0)
+    read(bag, bag, None)
+    joints, features, columns = write_tables(tmp_path, seconds=3.0)
+    read(joints, features, columns)
+    table = pd.read_csv(joints)
+    table["time_s"] = 1e-9 * table.pop("%time")
+    table.to_csv(joints, index=False)
+    columns.write_text(MAP[MAP.index("[features]") :])
+    whole = read(joints, features, columns)
+    assert not any(name.startswith("joint_velocity_command") for name in whole.table)
+    assert not caplog.records
