@@ -410,6 +410,7 @@ class _Problem:
         motion: joint positions over time, a spline.
         names: the parameters θ.
         scale: s, their prior deviations, (p,).
+        of_camera: which of them are the pose of the camera, (p,).
         nominal: pose of the nominal camera, (4, 4).
         model: the robot with the pose from which the camera deviates.
         pace: angular frequency of the latency's swing [rad/s].
@@ -429,7 +430,7 @@ class _Problem:
         self.names = _parameters(model, pixels=pixels)
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
-        self._of_camera = np.array([name.startswith("camera") for name in self.names])
+        self.of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model = model
         self.pace = 1.0
         # The last evaluation, and the z, pace and model that it belongs to.
@@ -446,7 +447,7 @@ class _Problem:
         found = {**begin, "latency": latency, "turning": placed.turning}
         start = np.array([found.get(name, 0.0) for name in self.names])
         # The pose of the camera is that of the model, so its own parameters begin at 0.
-        self.z = start / self.scale * ~self._of_camera
+        self.z = start / self.scale * ~self.of_camera
         self.model = self.model.with_camera(placed.pose)
 
     def _placed(self, model: RobotModel, latencies: FloatArray, turnings: FloatArray) -> _Placed:
@@ -580,7 +581,7 @@ class _Problem:
         self.play = CubicSpline(self.log.time, played(gears, play) / play)
         rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
         self.pull = CubicSpline(self.log.time, self._acceleration(rigid.feature(self.log.joints)))
-        return np.asarray(z * ~self._of_camera)
+        return np.asarray(z * ~self.of_camera)
 
     def _acceleration(self, path: FloatArray) -> FloatArray:
         """Return the second derivative of a path at the rows, (k, m), by cubics through what is near each row.
@@ -621,7 +622,7 @@ class _Problem:
         values = self.scale * z
         pose = self.pose(z)
         turn = Rotation.from_matrix(self.nominal[:3, :3].T @ pose[:3, :3]).as_rotvec()
-        values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
+        values[self.of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
         return values
 
 
@@ -827,6 +828,19 @@ def identify(
         noise, inliers = robust_covariance(problem.errors(z))
     without_prior = solved.jac[: -len(z)]
     return _posterior(problem, z, without_prior)
+
+
+def errors_along(log: Log, model: RobotModel, robot: Identified) -> tuple[Any, FloatArray]:
+    """Return rows of frames of a log, (k,), and their residuals, (k, m), by the robot of another part of it.
+
+    All parameters count, those of gears, tool and clocks, too; `model` is the nominal robot.
+    """
+    values = robot.values_by_name()
+    problem = _Problem(log, model, MAX_FRAMES, values)
+    problem.model = model.with_camera(robot.pose)
+    problem.pace = 2.0 * np.pi / robot.swing_period
+    z = robot.values / problem.scale * ~problem.of_camera
+    return problem.rows, problem.errors(problem.recentred(z))
 
 
 def _check_sensing(model: RobotModel) -> None:
