@@ -144,7 +144,7 @@ class Link:
             found = not np.ptp(q - self.posture) >= self.still
         self.lost = 0 if found else self.lost + 1
         if self.lost > 1:
-            raise RuntimeError(f"{BALL}: not found, or the same in two frames as the joints move")
+            raise RuntimeError("feature: not found, or the same in two frames as the joints move")
         self.q = q
         now = self.k * self.spec.period
         self.k += 1
@@ -188,11 +188,12 @@ class ROS2(servobench.Plant):
         if self.config.bag:
             self.bag = Writer(self.config.bag, version=9, storage_plugin=StoragePlugin.MCAP)
             self.bag.open()
-        self.listen(JOINTS, "sensor_msgs/msg/JointState", JointState, self.link.hear_joints)
-        self.listen(BALL, "geometry_msgs/msg/PointStamped", PointStamped, self.link.hear_ball)
+        # First, as the next joints may wait beside the command that they answer
         self.listen(
             COMMANDS, "std_msgs/msg/Float64MultiArray", Float64MultiArray, self.link.hear_command
         )
+        self.listen(JOINTS, "sensor_msgs/msg/JointState", JointState, self.link.hear_joints)
+        self.listen(BALL, "geometry_msgs/msg/PointStamped", PointStamped, self.link.hear_ball)
         self.commands = self.node.create_publisher(Float64MultiArray, COMMANDS, 10)
         self.thread = Thread(target=self.spin, daemon=True)
         self.thread.start()
@@ -208,7 +209,10 @@ class ROS2(servobench.Plant):
                 take(deserialize_message(packed, kind), self.now())
                 self.turn.notify()
                 if self.bag:
-                    self.bag.write(connection, time.time_ns(), packed)
+                    at = time.time_ns()
+                    if self.config.simulated:
+                        at = round(1e9 * self.link.stamps.get(JOINTS, 0.0))
+                    self.bag.write(connection, at, packed)
 
         # From any publisher, also from one that does not repeat lost messages
         self.node.create_subscription(kind, topic, hear, qos_profile_sensor_data, raw=True)
@@ -237,7 +241,7 @@ class ROS2(servobench.Plant):
     def observe(self):
         with self.turn:
             if not self.turn.wait_for(self.may_go_on, 20.0):  # [s] of the wall clock
-                self.link.end(f"{JOINTS} and {BALL} do not come, or nobody follows {COMMANDS}")
+                self.link.end("joints and ball do not come, or nobody follows commands")
             return self.link.observe()
 
     def may_go_on(self):

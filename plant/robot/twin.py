@@ -103,6 +103,8 @@ class TwinFile:
     """[1] share of the frames."""
     outlier_size: NonNegative = 0.0
     """[m or px] their usual distance."""
+    held_out: tuple[Number, ...] = ()
+    """[m or px] Errors of each feature in a part of the log, of a fit to the rest; for readers."""
     plant: dict[str, dict[str, Number | bool]] = field(default_factory=dict)
     """Further settings of sensing and mechanics, such as backlash."""
     mean: dict[str, Number] = field(default_factory=dict)

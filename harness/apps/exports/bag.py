@@ -1,8 +1,9 @@
 """A run as an MCAP file with messages of ROS 2, for Foxglove, rerun, `ros2 bag` and `servobench identify`.
 
 It has the signals of the run and, where a film of the run could be made, the true arm in 3-D: the URDF has a link for
-the ball, and two that fly, for the ball as it was measured and for its reference. Frames are the links of the URDF,
-`base` first, and `camera`. Times begin at 1 s, as a stamp of 0 stands for none in ROS.
+the ball, and two that fly, for the ball as it was measured and for its reference; markers are the way of the reference
+and the error. Frames are the links of the URDF, `base` first, and `camera`. Times begin at 1 s, as a stamp of 0 stands
+for none in ROS.
 """
 
 import math
@@ -26,6 +27,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND
 from servobench.plant.rendered import urdf
+from servobench.plant.robot.camera import PinholeCamera
 
 UNTURNED: Final = np.eye(3)  # a rotation
 CAMERA: Final = "camera"  # frame: z along the optical axis, x right and y down in the image
@@ -46,9 +48,16 @@ KINDS: Final = {  # topic, or its first part, -> kind of message
     "forward_velocity_controller": "std_msgs/msg/Float64MultiArray",
     "tf": "tf2_msgs/msg/TFMessage",
     "image": "sensor_msgs/msg/CompressedImage",
+    "camera_info": "sensor_msgs/msg/CameraInfo",
+    "marker": "visualization_msgs/msg/Marker",
     "steps": "std_msgs/msg/Float64",
     **dict.fromkeys(SIGNALS, "geometry_msgs/msg/PointStamped"),
 }
+LINE_STRIP: Final = 4  # types of markers
+LINE_LIST: Final = 5
+LINE_WIDTH: Final = 0.003  # [m]
+GREEN: Final = (0.1, 0.7, 0.3)
+RED: Final = (0.9, 0.1, 0.1)
 Message = dict[str, Any]  # fields by name; those that are missing are 0 or empty
 
 
@@ -85,6 +94,7 @@ def write_bag(path: Path, steps: pd.DataFrame, run: Mapping[Any, Any]) -> None:
                 messages |= _scene(shown, k, time)
             if replay is not None:
                 messages["image"] = _image(replay, k, time)
+                messages["camera_info"] = _camera_info(replay.camera, time)
             for topic, message in messages.items():
                 schema = schemas[KINDS[topic.partition("/")[0]]]
                 writer.write_message(f"/{topic}", schema, message, _nanoseconds(time))
@@ -155,7 +165,24 @@ def _scene(shown: LoggedRun, k: int, time: float) -> dict[str, Message]:
     }
     if k == 0:
         messages["robot_description"] = {"data": _description(shown)}
+        messages["marker/way"] = _line(time, LINE_STRIP, GREEN, shown.reference)
+    error = np.stack([shown.ball[k], shown.reference[k]])
+    messages["marker/error"] = _line(time, LINE_LIST, RED, error)
     return messages
+
+
+def _line(
+    time: float, kind: int, colour: tuple[float, float, float], points: FloatArray
+) -> Message:
+    """Return a marker of lines through points of the base frame, (k, 3) m; it stays until the next one."""
+    return {
+        "header": _header(time, urdf.BASE_LINK),
+        "type": kind,
+        "pose": {"orientation": {"w": 1.0}},
+        "scale": {"x": LINE_WIDTH},
+        "color": {**dict(zip("rgb", colour, strict=True)), "a": 1.0},
+        "points": [_vector(point) for point in points],
+    }
 
 
 def _transform(time: float, edge: tuple[str, str], place: FloatArray, R: FloatArray) -> Message:
@@ -178,3 +205,21 @@ def _image(replay: Replay, k: int, time: float) -> Message:
     replay.place(k)
     _, data = cv2.imencode(".jpg", np.flip(replay.camera_view(), axis=2))
     return {"header": _header(time, CAMERA), "format": "jpeg", "data": data.tobytes()}
+
+
+def _camera_info(camera: PinholeCamera, time: float) -> Message:
+    """Return the intrinsics of the image, that of an ideal pinhole; in ROS the centre of the first pixel is (0, 0)."""
+    centre = (0.5 * camera.width - 0.5, 0.5 * camera.height - 0.5)
+    projection = np.eye(3, 4)
+    projection[[0, 1], [0, 1]] = camera.focal
+    projection[:2, 2] = centre
+    return {
+        "header": _header(time, CAMERA),
+        "width": camera.width,
+        "height": camera.height,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5,
+        "k": projection[:, :3].ravel().tolist(),
+        "r": UNTURNED.ravel().tolist(),
+        "p": projection.ravel().tolist(),
+    }

@@ -162,7 +162,7 @@ class Replay(AbstractContextManager["Replay"]):
         self._fineness = fineness
         engine = load_engine(rendered_plant(str(run.track.row["plant"])))
         self._scene = engine.scene(Room(run.model.arm, scenery=True, robot=run.robot))
-        self._camera = run.robot.pinhole.reaching(run.robot.workspace.camera_distance)
+        self.camera = run.robot.pinhole.reaching(run.robot.workspace.camera_distance)
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]
         self._overview = Overview.of(run.robot.workspace.scale, fineness)
@@ -180,10 +180,10 @@ class Replay(AbstractContextManager["Replay"]):
 
     def camera_view(self) -> ByteArray:
         """Return the image of the run's camera with the detected ball marked, (h, w, 3)."""
-        rgba, buffer = self._scene.render(self._camera, self._pose)
+        rgba, buffer = self._scene.render(self.camera, self._pose)
         ball_radius = self._run.robot.workspace.ball_radius
-        found = find_ball(rgba, buffer, self._camera, ball_radius)
-        return draw_detection(rgba[..., :3], found, self._camera, ball_radius)
+        found = find_ball(rgba, buffer, self.camera, ball_radius)
+        return draw_detection(rgba[..., :3], found, self.camera, ball_radius)
 
     def overview(self, trails: list[Trail]) -> ByteArray:
         """Return the arm from outside with trails, pale where they are hidden: (480, 640, 3) times the fineness."""

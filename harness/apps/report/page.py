@@ -139,7 +139,7 @@ def report_pictures(folder: ResultsFolder, runs: pd.DataFrame) -> list[Picture]:
 
 def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
     views = path_views(folder, runs)
-    style = _asset("report.css")
+    style = page_style()
     scripts = [_asset("report.js")]
     if views:
         scripts.append(_asset("space.js"))
@@ -148,9 +148,9 @@ def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
     manifest = folder.manifest
     facts = describe_folder(manifest, runs)
-    return _template().render(
+    return page_template(TEMPLATE).render(
         folder=folder.path.resolve().name,
-        policy=_policy(style, scripts),
+        policy=page_policy(style, scripts),
         style=Markup(style),
         scripts=[Markup(script) for script in scripts],
         tables=tables,
@@ -176,25 +176,30 @@ def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
     )
 
 
-def _template() -> Template:
-    """Return the template of the page, with its filters."""
+def page_template(name: str, folder: Path = OWN) -> Template:
+    """Return a template of a folder, with the filters of this page and its macros for tables and pictures."""
     environment = Environment(
-        loader=FileSystemLoader(OWN),
+        loader=FileSystemLoader([folder, OWN]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters |= {"breakable": breakable, "cell": cell, "marked": marked, "sheet": sheet}
-    return environment.get_template(TEMPLATE)
+    return environment.get_template(name)
 
 
 def _asset(name: str) -> str:
     return (OWN / name).read_text(encoding="utf-8")
 
 
-def _policy(style: str, scripts: list[str]) -> str:
-    """Return the page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
+def page_style() -> str:
+    """Return the style of pages."""
+    return _asset("report.css")
+
+
+def page_policy(style: str, scripts: list[str]) -> str:
+    """Return a page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
 
     def digests(texts: list[str]) -> str:
         sources = []

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from servobench.harness.apps.twin.identification import Clocks
+    from servobench.harness.apps.twin.summary import Answer
+    from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import ResolvedRun
 
 IDENTIFYING: Final = "constant"  # a controller, which identification does not run
@@ -119,22 +121,33 @@ def identify(
     out: Annotated[
         Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")
     ] = None,
+    page: Annotated[
+        Path | None,
+        option("FILE.html", "Page about the twin: intervals, residuals, where it is sure."),
+    ] = None,
 ) -> None:
     """Identify arm, camera and drive from a log, as a twin.
 
     A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
     """
     from servobench.harness.apps.twin.drive import command_response
+    from servobench.harness.apps.twin.held_out import held_out
     from servobench.harness.apps.twin.identification import read_log
     from servobench.harness.apps.twin.preflight import mistakes
-    from servobench.harness.apps.twin.summary import estimates, remarks
-    from servobench.harness.apps.twin.twin_file import twin_text
+    from servobench.harness.apps.twin.summary import (
+        Answer,
+        estimates,
+        held_out_line,
+        remarks,
+    )
     from servobench.harness.batch.logs import UnevenRows
+    from servobench.harness.config.installation import check_installed
     from servobench.harness.config.sensing import find_sensing
     from servobench.harness.run.experiment import build
-    from servobench.harness.run.request import RunSettings
-    from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
+    from servobench.plant.robot.catalogue import ROBOTS, find_robot
 
+    if page is not None:
+        check_installed(("jinja2",), "--page")
     try:
         name, resolved, table, clocks = _logged(
             log, run, IDENTIFYING, (robot, sensing), out, streams
@@ -160,10 +173,12 @@ def identify(
     experiment.plant.close()
     apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
+        nominal = setup.nominal(own)
         mistake, found = mistakes(
-            rows, setup.nominal(own), lambda: {k: setup.nominal(find_robot(k)) for k in apart}
+            rows, nominal, lambda: {k: setup.nominal(find_robot(k)) for k in apart}
         )
         response = command_response(rows)
+        held = held_out(rows, nominal, found) if found else None
     if found is None:
         say(f"{name}: {mistake}")
         sys.exit(FAILED)
@@ -171,21 +186,46 @@ def identify(
         [(f"{name} against the nominal {own.title}, where they differ", estimates(found, response))]
     )
     say("\n".join(remarks(rows, found, response)))
+    say(held_out_line(rows, held))
+    answer = Answer(own.title, name, rows, nominal, found, response, held)
+    if page is not None:
+        from servobench.harness.apps.twin.page import write_page
+
+        with accessing(page):
+            write_page(answer, page)
+        say(f"page in {page}")
     if out is not None:
-        with accessing(out):
-            folder = out.resolve().parent  # where the twin looks for files first
-            named = with_files(
-                request.robot,
-                lambda file: (
-                    os.path.relpath(user_path(file), folder) if user_path(file).is_file() else file
-                ),
-            )
-            text = twin_text(found, rows, response, (named, request.sensing))
-            write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
-        next_one = f"servobench compare --robot {quote(str(out))} --plants kinematic"
-        if abs(resolved.run.period - RunSettings.period) > PERIOD_TOLERANCE * RunSettings.period:
-            next_one += f" --set run.period={_as_clock(resolved.run.period)}"
-        say(f"twin in {out}; the next command: {next_one}")
+        _write_twin(answer, request, out)
+        _say_next(out, resolved.run.period)
+
+
+def _write_twin(answer: Answer, request: RunRequest, out: Path) -> None:
+    """Write the file of a twin of the robot and the sensing of a request."""
+    from servobench.harness.apps.twin.twin_file import twin_text
+    from servobench.plant.robot.catalogue import with_files
+
+    folder = out.resolve().parent  # where the twin looks for files first
+
+    def beside(file: str) -> str:
+        path = user_path(file)
+        if path.is_file():
+            return os.path.relpath(path, folder)
+        return file
+
+    with accessing(out):
+        named = (with_files(request.robot, beside), request.sensing)
+        text = twin_text(answer.robot, answer.log, answer.response, named, answer.held)
+        write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _say_next(twin: Path, period: float) -> None:
+    """Say where a twin is, and the next command, given the control period of its log [s]."""
+    from servobench.harness.run.request import RunSettings
+
+    next_one = f"servobench compare --robot {quote(str(twin))} --plants kinematic"
+    if abs(period - RunSettings.period) > PERIOD_TOLERANCE * RunSettings.period:
+        next_one += f" --set run.period={_as_clock(period)}"
+    say(f"twin in {twin}; the next command: {next_one}")
 
 
 def _as_clock(period: float) -> str:

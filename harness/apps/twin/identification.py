@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicSpline  # which loads the others, too
 from scipy.optimize import least_squares
+from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
 from servobench.controllers.algebra import nearest_rotation
@@ -84,8 +85,12 @@ MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNLIKELY: Final = 3.0  # [1] A parameter of the arm is unlikely beyond this many prior deviations.
 TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] tried in the first search
 SWING_PERIODS: Final = np.geomspace(1.0, 20.0, 120)  # [s] tried in the search
+# A swing is taken if it explains this many times the mean square of the frames; the best of noise explains 10 to 15.
+MIN_WAVE: Final = 25.0  # [1]
 MIN_SWINGS: Final = 3  # A log must be longer than this many periods of a swing.
 RIPPLE_ORDER: Final = MechanicsConfig().ripple_order
+ACCELERATION_SPAN: Final = 0.2  # [s] of rows from which an acceleration is taken
+MIN_CUBIC_ROWS: Final = 5
 MIN_PLAY: Final = 0.002  # [rad] play about which its effect is linearised
 # The log tells a parameter if its deviation grows less than this with a prior of twice the width.
 MAX_PRIOR_EFFECT: Final = 1.2  # [1]
@@ -405,6 +410,7 @@ class _Problem:
         motion: joint positions over time, a spline.
         names: the parameters θ.
         scale: s, their prior deviations, (p,).
+        of_camera: which of them are the pose of the camera, (p,).
         nominal: pose of the nominal camera, (4, 4).
         model: the robot with the pose from which the camera deviates.
         pace: angular frequency of the latency's swing [rad/s].
@@ -424,7 +430,7 @@ class _Problem:
         self.names = _parameters(model, pixels=pixels)
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
-        self._of_camera = np.array([name.startswith("camera") for name in self.names])
+        self.of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model = model
         self.pace = 1.0
         # The last evaluation, and the z, pace and model that it belongs to.
@@ -441,7 +447,7 @@ class _Problem:
         found = {**begin, "latency": latency, "turning": placed.turning}
         start = np.array([found.get(name, 0.0) for name in self.names])
         # The pose of the camera is that of the model, so its own parameters begin at 0.
-        self.z = start / self.scale * ~self._of_camera
+        self.z = start / self.scale * ~self.of_camera
         self.model = self.model.with_camera(placed.pose)
 
     def _placed(self, model: RobotModel, latencies: FloatArray, turnings: FloatArray) -> _Placed:
@@ -574,8 +580,18 @@ class _Problem:
         gears = transmitted(self.log.joints, values["ripple"], RIPPLE_ORDER)
         self.play = CubicSpline(self.log.time, played(gears, play) / play)
         rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
-        self.pull = CubicSpline(self.log.time, rigid.feature(self.log.joints)).derivative(2)
-        return np.asarray(z * ~self._of_camera)
+        self.pull = CubicSpline(self.log.time, self._acceleration(rigid.feature(self.log.joints)))
+        return np.asarray(z * ~self.of_camera)
+
+    def _acceleration(self, path: FloatArray) -> FloatArray:
+        """Return the second derivative of a path at the rows, (k, m), by cubics through what is near each row.
+
+        That of a spline through all rows consists of the noise of the joints, such as jitter of their stamps; the frame
+        has the same noise, so that a tool of negative compliance would explain it.
+        """
+        period = self.log.spec.period
+        rows = max(2 * round(0.5 * ACCELERATION_SPAN / period) + 1, MIN_CUBIC_ROWS)
+        return np.asarray(savgol_filter(path, rows, 3, deriv=2, delta=period, axis=0))
 
     def swung(self, z: FloatArray) -> FloatArray:
         """Take the period with which the latency swings most likely, and return the z with the sizes there.
@@ -591,9 +607,13 @@ class _Problem:
         # Cauchy weights, so that outliers count little.
         scaled = late / np.median(np.abs(late))
         weight = np.sqrt(weight / (1.0 + scaled**2))
-        z[swings] = 0.0
-        if wave := fitted_wave(self.time, late, weight):
-            self.pace, sizes, _ = wave
+        wave = fitted_wave(self.time, late, weight)
+        if wave is None:
+            return z
+        pace, sizes, left = wave
+        # The best of many periods explains some of any noise, and with it what belongs to other parameters.
+        if len(late) * (1.0 - left) > MIN_WAVE:
+            self.pace = pace
             z[swings] = sizes / prior("swing")
         return z
 
@@ -602,7 +622,7 @@ class _Problem:
         values = self.scale * z
         pose = self.pose(z)
         turn = Rotation.from_matrix(self.nominal[:3, :3].T @ pose[:3, :3]).as_rotvec()
-        values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
+        values[self.of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
         return values
 
 
@@ -808,6 +828,19 @@ def identify(
         noise, inliers = robust_covariance(problem.errors(z))
     without_prior = solved.jac[: -len(z)]
     return _posterior(problem, z, without_prior)
+
+
+def errors_along(log: Log, model: RobotModel, robot: Identified) -> tuple[Any, FloatArray]:
+    """Return rows of frames of a log, (k,), and their residuals, (k, m), by the robot of another part of it.
+
+    All parameters count, those of gears, tool and clocks, too; `model` is the nominal robot.
+    """
+    values = robot.values_by_name()
+    problem = _Problem(log, model, MAX_FRAMES, values)
+    problem.model = model.with_camera(robot.pose)
+    problem.pace = 2.0 * np.pi / robot.swing_period
+    z = robot.values / problem.scale * ~problem.of_camera
+    return problem.rows, problem.errors(problem.recentred(z))
 
 
 def _check_sensing(model: RobotModel) -> None:

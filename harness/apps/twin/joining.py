@@ -8,15 +8,23 @@ exposure to recording, relative to that of joints, and the offset is the latency
 """
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.interpolate import PchipInterpolator
 
 from servobench.harness.apps.twin.identification import CAPTURED, MAX_LATENCY, Clocks
-from servobench.harness.apps.twin.streams import USUAL, Stream, StreamMap, read_map, read_stream
+from servobench.harness.apps.twin.streams import (
+    USUAL,
+    Stream,
+    StreamAbsent,
+    StreamMap,
+    read_map,
+    read_stream,
+)
 from servobench.harness.batch.logs import PLANT, TASK
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings
@@ -25,13 +33,22 @@ from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import TIME
-from servobench.plant.contract.signals import column_names
+from servobench.plant.contract.settings import remark
+from servobench.plant.contract.signals import PlantSpec, column_names
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch
 
 MAX_OFFSET: Final = 1.0  # [s] between clocks, with the latency, within which it is sought
 ROUNDING: Final = 1e-3  # [rows] by which a frame may come after its row
+
+
+class _Frames(NamedTuple):
+    """Frames by the clock of the joints."""
+
+    captured: FloatArray  # stamps, (f,) [s]
+    arrived: FloatArray  # (f,) [s]
+    values: FloatArray  # (f, m)
 
 
 def joined(
@@ -56,46 +73,72 @@ def joined(
     keys = read_map(columns)
     moved = read_stream(joints, "joints", keys.joints, spec)
     seen = read_stream(features, "features", keys.features, spec)
-    clocks = Clocks(-MAX_OFFSET, MAX_OFFSET, None)
-    captured = seen.time
-    arrived = seen.time
-    delay = _delay(moved)
-    delivery = _delay(seen) - delay
-    if joints.samefile(features) and math.isfinite(delivery):
-        clocks = Clocks(0.0, MAX_LATENCY, delivery)
-        captured = seen.time + delivery
-        arrived = seen.received - delay
+    clocks, frames = _by_clock_of_joints(moved, seen, same_file=joints.samefile(features))
+    period = min(_period(moved.time), _period(frames.captured))
+    table = _rows(moved, frames, period, column_names(spec))
     begin, *_, end = moved.time.tolist()
-    period = min(_period(moved.time), _period(captured))
-    time = np.arange(0.0, end - begin, period)
-    names = column_names(spec)
-    positions = PchipInterpolator(moved.time - begin, moved.values)(time)
-    table = pd.DataFrame(positions, columns=names["joint_position"])
-    table.insert(0, TIME, time)
-    frames = _in_rows(
-        (arrived - begin) / period, np.column_stack([seen.values, captured]), len(time)
-    )
-    table[names["feature"]] = frames[:, :-1]
-    table[CAPTURED] = frames[:, -1] - begin
     last = end - begin + clocks.lowest
     table["feature_valid"] = table[CAPTURED].between(clocks.highest, last)
     if not table["feature_valid"].any():
-        span = f"features run from {captured[0]:.3f} s on, joints from {begin:.3f} to {end:.3f} s"
+        first = frames.captured[0]
+        span = f"features run from {first:.3f} s on, joints from {begin:.3f} to {end:.3f} s"
         remedy = "if clocks are apart, write offset = … (in s) in [features] of the map"
         raise ConfigurationError(f"{features} and {joints} do not overlap: {span}; {remedy}")
     further = (("commands", joints, keys.commands), ("reference", features, keys.reference))
     for kind, path, own in further:
-        try:
-            stream = read_stream(path, kind, own, spec)
-        except ConfigurationError:
-            if own != StreamMap():
-                raise
-            continue
-        newest = np.searchsorted(stream.time - begin, time + 0.5 * period) - 1
-        table[names[USUAL[kind][0]]] = stream.values[np.maximum(newest, 0)]
+        stream = _further_stream(path, kind, own, spec)
+        if stream is not None:
+            middles = table[TIME] + 0.5 * period
+            newest = np.searchsorted(stream.time - begin, middles) - 1
+            signal, *_ = USUAL[kind]
+            table[column_names(spec)[signal]] = stream.values[np.maximum(newest, 0)]
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
     settings = Settings({"run": {"period": period}, PLANT: {"command_delay": 0.0}})
     return resolve(request, settings), table, clocks
+
+
+def _by_clock_of_joints(moved: Stream, seen: Stream, *, same_file: bool) -> tuple[Clocks, _Frames]:
+    """Return the clocks of two streams, and frames whose stamps are set on by how much longer they take to a recorder.
+
+    Without times of recording by one clock, stamps stay as they are.
+    """
+    delay = _delay(moved)
+    delivery = _delay(seen) - delay
+    if same_file and math.isfinite(delivery):
+        frames = _Frames(seen.time + delivery, seen.received - delay, seen.values)
+        return Clocks(0.0, MAX_LATENCY, delivery), frames
+    return Clocks(-MAX_OFFSET, MAX_OFFSET, None), _Frames(seen.time, seen.time, seen.values)
+
+
+def _rows(
+    moved: Stream, frames: _Frames, period: float, names: Mapping[str, list[str]]
+) -> pd.DataFrame:
+    """Return rows `period` [s] apart from the first joints on: joints, and frames where they arrived."""
+    begin, *_, end = moved.time.tolist()
+    time = np.arange(0.0, end - begin, period)
+    positions = PchipInterpolator(moved.time - begin, moved.values)(time)
+    table = pd.DataFrame(positions, columns=names["joint_position"])
+    table.insert(0, TIME, time)
+    places = (frames.arrived - begin) / period
+    values = _in_rows(places, np.column_stack([frames.values, frames.captured]), len(time))
+    table[names["feature"]] = values[:, :-1]
+    table[CAPTURED] = values[:, -1] - begin
+    return table
+
+
+def _further_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stream | None:
+    """Return a stream that a log may lack, None for none; one that is there but broken is named and left out.
+
+    One that the map describes has to be there, and whole.
+    """
+    try:
+        return read_stream(path, kind, keys, spec)
+    except ConfigurationError as error:
+        if keys != StreamMap():
+            raise
+        if not isinstance(error, StreamAbsent):
+            remark(f"{error}; {kind} are left out")
+        return None
 
 
 def _period(stamps: FloatArray) -> float:

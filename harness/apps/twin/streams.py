@@ -75,6 +75,10 @@ USUAL: Final = {  # stream -> its kind of columns in a table of steps, its topic
 }
 
 
+class StreamAbsent(ConfigurationError):
+    """A file has no such stream at all."""
+
+
 class Stream(NamedTuple):
     """Values with their stamps."""
 
@@ -105,7 +109,8 @@ def read_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stre
         spec: of the robot: names and numbers of joints and features.
 
     Raises:
-        ConfigurationError: file, topic, field, column or joint cannot be found or read.
+        StreamAbsent: the bag has no such topic, or the table none of the columns.
+        ConfigurationError: file, field, column or joint cannot be found or read.
         UnevenRows: stamps that are doubled or out of order.
     """
     if not path.exists():
@@ -115,8 +120,9 @@ def read_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stre
     is_table = path.suffix.lower() in TABLES
     table = read_table(kind, path) if is_table else _read_topic(path, keys.topic or topic)
     names = column_names(spec)[signal]
-    in_ros = [f"{joint}_joint" for joint in spec.joint_names]
-    usual = [names, of_messages[: len(names)], spec.joint_names, in_ros]
+    usual = [names, of_messages[: len(names)]]
+    if kind == "joints":
+        usual += [spec.joint_names, [f"{joint}_joint" for joint in spec.joint_names]]
     found = (list(each) for each in usual if each and set(each) <= set(table))
     columns = list(keys.fields) or next(found, names)
     stamps = keys.time or next((each for each in (STAMP, RECEIVED) if each in table), TIME)
@@ -126,7 +132,10 @@ def read_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stre
     if lacking:
         remedy = f"name topic, time and fields in [{kind}] of the map"
         known = suggest(lacking[0], map(str, table))
-        raise ConfigurationError(f"{what} has no {lacking[0]}; {remedy}: {known}")
+        fault = ConfigurationError
+        if is_table and set(columns).isdisjoint(table):
+            fault = StreamAbsent
+        raise fault(f"{what} has no {lacking[0]}; {remedy}: {known}")
     table = table[table[columns].notna().all(axis=1)]
     time = keys.offset + _seconds(what, table, stamps, keys.unit)
     _check_order(what, time)
@@ -173,9 +182,7 @@ def _read_topic(path: Path, topic: str) -> pd.DataFrame:
             chosen = [each for each in bag.connections if each.topic == topic]
             if not chosen:
                 known = suggest(topic, bag.topics)
-                raise ConfigurationError(
-                    f"{path} has no topic {topic}; name it in the map: {known}"
-                )
+                raise StreamAbsent(f"{path} has no topic {topic}; name it in the map: {known}")
             for connection, received, raw in bag.messages(connections=chosen):
                 message = bag.deserialize(raw, connection.msgtype)
                 rows.append({**dict(_flat("", message)), RECEIVED: NANOSECOND * received})
@@ -183,7 +190,10 @@ def _read_topic(path: Path, topic: str) -> pd.DataFrame:
         found = f"{path} cannot be read as a bag ({type(error).__name__}: {error})"
         remedy = "wanted a finished MCAP file, a rosbag2 folder, .db3 or .bag; `mcap recover` repairs one"
         raise ConfigurationError(f"{found}; {remedy}") from error
-    return pd.DataFrame(rows)
+    table = pd.DataFrame(rows)
+    if STAMP in table:  # a publisher may repeat a message, as a robot does that waits in lockstep
+        table = table.drop_duplicates([name for name in table if name != RECEIVED])
+    return table
 
 
 def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - any part of a message

@@ -1,12 +1,13 @@
 """Identified robots in words: a table of estimates, and remarks on the log that they come from."""
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from servobench.harness.apps.twin.drive import MIN_MOTION, SUSPECT_SHARE, Response, untold_response
+from servobench.harness.apps.twin.held_out import HeldOut
 from servobench.harness.apps.twin.identification import (
     EXTRAS,
     Clocks,
@@ -16,6 +17,8 @@ from servobench.harness.apps.twin.identification import (
     prior,
 )
 from servobench.harness.apps.twin.sensor import lost_share, sensor
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.twin import TIMES
 
 MIN_TIMES: Final = 1e-3  # [s] No drive has a smaller sum of delay and lag.
@@ -37,6 +40,18 @@ UNITS: Final = {
     "zero": ("°", 180.0 / math.pi),
     "link": ("%", 1e2),
 }
+
+
+class Answer(NamedTuple):
+    """What was identified, and from what."""
+
+    title: str  # the robot
+    source: str  # name of the log
+    log: Log
+    nominal: RobotModel
+    robot: Identified
+    response: Response | None
+    held: HeldOut | None
 
 
 def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
@@ -85,18 +100,37 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
 
 def _noise_line(log: Log, robot: Identified) -> str:
     """Return the residuals of each feature, and the shares of outliers and of lost frames."""
-    unit = log.spec.feature.unit
-    scale = 1.0
-    if unit == "m":
-        unit = "mm"
-        scale = 1e3
-    deviations = np.sqrt(np.diag(robot.noise))
-    each = zip(log.spec.feature_names, deviations, strict=True)
-    noise = ", ".join(f"{name} {scale * deviation:.2g}" for name, deviation in each)
+    unit, _ = handy(log)
+    noise = _sizes(log, np.sqrt(np.diag(robot.noise)))
     outliers = 1.0 - robot.inliers.mean()
     return (
         f"residuals [{unit}]: {noise}; outliers {outliers:.1%}, lost frames {lost_share(log):.1%}"
     )
+
+
+def held_out_line(log: Log, held: HeldOut | None) -> str:
+    """Return the errors in the window that was held out; empty without one."""
+    if held is None:
+        return ""
+    unit, _ = handy(log)
+    window = f"held out, {held.begin:.1f} to {held.end:.1f} s, for a fit to the frames before"
+    errors = f"errors [{unit}]: {_sizes(log, held.deviations)}"
+    return f"{window}: {errors}, {held.ratio:.2f} times its residuals"
+
+
+def handy(log: Log) -> tuple[str, float]:
+    """Return the unit in which errors of features are printed, and how many of these are one of the feature's."""
+    unit = log.spec.feature.unit
+    if unit == "m":
+        return "mm", 1e3
+    return unit, 1.0
+
+
+def _sizes(log: Log, deviations: FloatArray) -> str:
+    """Return deviations of the features by name."""
+    _, scale = handy(log)
+    each = zip(log.spec.feature_names, deviations, strict=True)
+    return ", ".join(f"{name} {scale * deviation:.2g}" for name, deviation in each)
 
 
 def _clock_line(clocks: Clocks, robot: Identified) -> str:

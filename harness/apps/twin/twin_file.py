@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from servobench.harness.apps.twin.drive import Response
+from servobench.harness.apps.twin.held_out import HeldOut
 from servobench.harness.apps.twin.identification import EXTRAS, Identified, Log
 from servobench.harness.apps.twin.sensor import frame_period, sensor
 from servobench.harness.config.description import toml
@@ -14,7 +15,11 @@ from servobench.plant.robot.twin import TIMES
 
 
 def twin_text(
-    robot: Identified, log: Log, response: Response | None, named: tuple[str, str]
+    robot: Identified,
+    log: Log,
+    response: Response | None,
+    named: tuple[str, str],
+    held: HeldOut | None = None,
 ) -> str:
     """Return the file of a twin.
 
@@ -23,6 +28,7 @@ def twin_text(
         log: the log that it was identified from.
         response: to commands, if the log tells it.
         named: robot and sensing.
+        held: errors in a window that was held out.
     """
     own = [k for k, name in enumerate(robot.names) if name not in EXTRAS]
     names = [robot.names[k] for k in own]
@@ -47,6 +53,8 @@ def twin_text(
         false = robot.residuals[measured.outliers]
         top["outliers"] = float(measured.outliers.mean())
         top["outlier_size"] = float(np.sqrt(np.mean(false**2)))
+    if held is not None:
+        top["held_out"] = held.deviations
     top["parameters"] = names
     top["factor"] = factor
     camera = {"latency": measured.latency, "rate": 1.0 / frame_period(log)}

@@ -148,7 +148,30 @@ def test_a_rendered_run_has_the_image_of_its_camera(tmp_path):
     _, image = messages_of(file)["/image"][-1]
     picture = cv2.imdecode(image.data, cv2.IMREAD_COLOR)
     blue, green, red = picture.astype(int).transpose(2, 0, 1)
-    assert (red - np.maximum(blue, green) > 60).sum() > 20  # the ball
+    ball = red - np.maximum(blue, green) > 60
+    assert ball.sum() > 20
+    _, info = messages_of(file)["/camera_info"][-1]
+    assert (info.height, info.width) == picture.shape[:2]
+    seen = info.k.reshape(3, 3) @ places(messages_of(file)["/true_feature"])[-1]
+    rows, columns = np.nonzero(ball)
+    np.testing.assert_allclose(seen[:2] / seen[2], [columns.mean(), rows.mean()], atol=3.0)
+    np.testing.assert_array_equal(info.p.reshape(3, 4)[:, :3], info.k.reshape(3, 3))
+
+
+def test_markers_lead_from_the_ball_to_its_reference(folder, tmp_path):
+    run_id = load(folder).runs["run_id"].iloc[0]
+    export_folder(ResultsFolder(folder), tmp_path / "mcap", "mcap")
+    found = messages_of(tmp_path / "mcap" / f"{run_id}.mcap")
+    ((_, way),) = found["/marker/way"]
+    errors = [message for _, message in found["/marker/error"]]
+    assert len(way.points) == len(errors) == len(found["/tf"])
+    for k, message in enumerate(errors):
+        assert message.header.frame_id == "base"
+        ball, reference = np.array([[p.x, p.y, p.z] for p in message.points])
+        on_way = way.points[k]
+        np.testing.assert_array_equal(reference, [on_way.x, on_way.y, on_way.z])
+        shown = places(found["/true_feature"])[k] - places(found["/reference"])[k]
+        assert np.linalg.norm(ball - reference) == pytest.approx(np.linalg.norm(shown), abs=1e-9)
 
 
 def test_a_run_without_a_film_has_its_signals_alone(tmp_path, output_of):

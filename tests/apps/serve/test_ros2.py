@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from contextlib import contextmanager
 from importlib.util import find_spec
 
@@ -46,18 +47,18 @@ def robot(*arguments):
         process.communicate(timeout=20)
 
 
-def node(out, *arguments):
+def node(out, *arguments, controller="ukf_mfac"):
     """Start the example."""
     return subprocess.Popen(
-        [sys.executable, str(EXAMPLE), "ukf_mfac", "--out", str(out), *arguments], text=True,
+        [sys.executable, str(EXAMPLE), controller, "--out", str(out), *arguments], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": str(PACKAGE), "COLUMNS": "200"},
     )  # fmt: skip
 
 
-def finished(process):
+def finished(process, timeout=90):
     """Return the exit code of a process once it has ended, and what it said."""
-    said, errors = process.communicate(timeout=90)
+    said, errors = process.communicate(timeout=timeout)
     return process.returncode, said + errors
 
 
@@ -186,3 +187,25 @@ def test_a_bag_has_all_messages(tmp_path):
             counts[connection.topic] = counts.get(connection.topic, 0) + 1
     assert set(counts) == {"/joint_states", "/feature", "/forward_velocity_controller/commands"}
     assert min(counts.values()) >= 39
+
+
+def test_the_bag_of_a_node_tells_the_delays_that_were_there(tmp_path):
+    pytest.importorskip("rosbags.highlevel")
+    times = {"sensing.latency": 0.08, "command_delay": 0.03, "lag": 0.07}
+    given = [word for key, value in times.items() for word in ("--set", f"kinematic.{key}={value}")]
+    bag, twin = tmp_path / "bag", tmp_path / "twin.toml"
+    with robot("--lockstep", *given):
+        run = node(
+            tmp_path / "out", *WIDE, "--set", "ROS2.simulated=true", "--set", f"ROS2.bag={bag}",
+            "--set", "target.duration=40", "--set", "Excite.swing=0.25", "--set", "Excite.reach=0.15",
+            controller=str(ROOT / "docs" / "examples" / "excite.py"),
+        )  # fmt: skip
+        code, said = finished(run, timeout=300)
+    assert code == 0, said
+    process = start("identify", "--joints", str(bag), "--robot", "ur5e", "--out", str(twin))
+    said, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, said + errors
+    found = tomllib.loads(twin.read_text(encoding="utf-8"))
+    assert found["camera"]["latency"] == pytest.approx(0.08, abs=0.004)
+    assert found["mean"]["command_delay"] == pytest.approx(0.03, abs=1e-3)
+    assert found["mean"]["lag"] == pytest.approx(0.07, abs=1e-3)
