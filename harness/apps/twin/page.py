@@ -16,11 +16,10 @@ from matplotlib.ticker import LogLocator
 
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.apps.figures.style import (
+    COLOURS,
     JOINTS,
     NARROW,
-    ORANGE,
     TEXT,
-    VERMILION,
     WIDE,
     Layout,
     add_legend,
@@ -152,7 +151,11 @@ def _over_time(answer: Answer, layout: Layout) -> Figure:
         _draw_binned(axes, time, scale * own[:, None], robot.inliers)
         if answer.held is not None:
             axes.axvspan(
-                answer.held.begin, answer.held.end, color=ORANGE, alpha=0.15, label="held out"
+                answer.held.begin,
+                answer.held.end,
+                color=COLOURS["orange"],
+                alpha=0.15,
+                label="held out",
             )
     label_rows(panels, f"residual [{unit}]")
     add_legend(figure, panels)
@@ -180,7 +183,7 @@ def _over_posture(answer: Answer, layout: Layout) -> Figure:
 def _draw_binned(axes: Axes, x: FloatArray, residuals: FloatArray, inliers: BoolArray) -> None:
     """Draw residuals (k, c) over x (k,), and the mean of each component in parts of x with its interval of 95 %."""
     axes.plot(x[inliers], residuals[inliers], color="0.75", **DRAWN)
-    (mark, *_) = axes.plot(x[~inliers], residuals[~inliers], color=VERMILION, **DRAWN)
+    (mark, *_) = axes.plot(x[~inliers], residuals[~inliers], color=COLOURS["vermilion"], **DRAWN)
     mark.set_label("outlier")
     height = AXIS_ROOM * float(np.std(residuals[inliers]))
     axes.set_ylim(-height, height)
