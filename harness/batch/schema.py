@@ -19,7 +19,7 @@ ENTRIES: Final[dict[str, tuple[type, ...]]] = {  # of a manifest: its type, and 
     "robots": (list, dict), "configuration": (dict, dict), "changed": (dict,), "own_controllers": (dict, dict),
     "own_plants": (dict, dict), "own_tasks": (dict, dict), "own_metrics": (dict, dict), "plugins": (dict, dict),
     "packages": (dict,), "engines": (dict,), "blas": (list, dict), "files": (dict, str), "side_by_side": (dict, list),
-    "tuned": (dict, dict),
+    "tuned": (dict, dict), "until_decided": (dict,),
 }  # fmt: skip
 WORDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
 SHOWN: Final = 60  # letters of a wrong value that a message holds

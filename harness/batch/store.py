@@ -21,6 +21,7 @@ from servobench.harness.batch.results import (
     STEPS,
     ResultsFolder,
     part_name,
+    wanted_runs,
 )
 from servobench.harness.batch.schema import MANIFEST, encode
 from servobench.harness.batch.tables import writing
@@ -127,7 +128,7 @@ def collect(folder: ResultsFolder) -> int:
 def put_together(folder: ResultsFolder, manifest: Mapping[str, Any]) -> int:
     """Put the parts of a folder with this manifest together; result and errors are those of `collect`."""
     path = folder.path
-    wanted = manifest.get("run_count", 0)
+    wanted = wanted_runs(manifest)
     if folder.is_whole(wanted):  # at most the clean-up is left
         shutil.rmtree(path / PARTS, ignore_errors=True)
         return tables.row_count(path, RUNS)
