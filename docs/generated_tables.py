@@ -48,6 +48,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 import stored_tables
 from page_studies import STUDIES
 from servobench.controllers.aids import EQUIPPED, AidsConfig
@@ -251,7 +253,25 @@ def measured(part: re.Match[str], folder: Path) -> str:
         rows = rows.set_index(rows.columns[0], drop=False).loc[wanted]
     if columns:
         rows = rows.iloc[:, [int(number) - 1 for number in columns.split(",")]]
-    return f"{table(tuple(rows), rows.itertuples(index=False))}\n\n{origin}; [commands]({links[named]})"
+    stamp_line = f"{origin}; [commands]({links[named]})"
+    fine = least_differences(rows)
+    if fine and folder != ROOT:  # the first page has no room
+        stamp_line += f"; robots are resampled; unpaired cells differ from {fine} on"
+    return f"{table(tuple(rows), rows.itertuples(index=False))}\n\n{stamp_line}"
+
+
+def least_differences(rows: pd.DataFrame) -> str:
+    """Return for each column with intervals √2 times the median of their half-widths; columns alike share one."""
+    found: dict[str, list[str]] = {}
+    for name in rows:
+        ends = rows[name].str.extract(r"\[([-+]?[\d.]+), ([-+]?[\d.]+)\]").astype(float).dropna()
+        if len(ends):
+            reach = (ends[1] - ends[0]).median() / 2.0**0.5
+            least = f"{reach:.1g}" if reach else "the last digit"
+            found.setdefault(least, []).append(str(name))
+    if len(found) < 2:
+        return "".join(found)
+    return ", ".join(f"{least} ({', '.join(names)})" for least, names in found.items())
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name

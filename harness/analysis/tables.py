@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
+import numpy as np
 import pandas as pd
 
 from servobench.controllers.methods import PUBLISHED
@@ -47,6 +48,11 @@ from servobench.harness.analysis.comparison import (
     tail_mean,
     texts_of,
     with_places,
+)
+from servobench.harness.analysis.fineness import (
+    MIN_AGREEMENT,
+    agreement_of_halves,
+    least_difference,
 )
 from servobench.harness.analysis.verdict import judged_column, judged_metric
 from servobench.harness.run.metrics import METRICS
@@ -153,6 +159,8 @@ class JudgedPlace(NamedTuple):
     pairs: list[Row]
     measure: str  # metric by which pairs are compared, with its unit; empty without pairs
     margin: str  # difference that does not matter, with its unit; likewise
+    least: str  # difference that the median pair could tell, with its unit; likewise
+    stable: int  # number of pairs that halves of the robots order alike
 
 
 class Statistics(NamedTuple):
@@ -175,9 +183,11 @@ class Statistics(NamedTuple):
         """The levels of intervals, and the test behind p-values with its family."""
         if not any(place.pairs for place in self.places):
             return "brackets: 95 %"
+        stable = sum(place.stable for place in self.places)
         return (
-            "brackets: 95 %, of mean differences 90 %\n"
-            f"p: two-sided sign test; after Holm's correction over the {self.family}"
+            "brackets: 95 %, of mean differences 90 %; resampled and split: robots\n"
+            f"p: two-sided sign test; after Holm's correction over the {self.family}\n"
+            f"halves of the robots order {stable} of these pairs alike in {100 * MIN_AGREEMENT:.0f} % of the splits"
         )
 
     def tables(self) -> Tables:
@@ -186,6 +196,8 @@ class Statistics(NamedTuple):
             yield place.words, as_text(place.controllers)
             if place.pairs:
                 title = f"paired differences, verdicts with a margin of {place.margin}"
+                if place.least:
+                    title += f"; the runs can tell {place.least}"
                 yield title, as_text(place.pairs)
 
 
@@ -265,12 +277,12 @@ def _pairs(
     return [(first, second) for first, second in pairs if seeds.get(first, set()) & seeds[second]]
 
 
-def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str, str]:
-    """Return a row for each pair of a place that is shown, with their metric and its margin as they are shown."""
+def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str, str, str, int]:
+    """Return a row for each pair of a place that is shown, and what a `JudgedPlace` says of all of them."""
     pairs = _pairs(runs, selection.names, selection.against)
     metric = selection.metric or judged_metric(runs)
     if not pairs and selection.metric is None:
-        return [], "", ""
+        return [], "", "", "", 0
     if not pairs:
         raise ConfigurationError(
             f"no two controllers have runs of one seed to compare; leave --metric {metric} out"
@@ -308,7 +320,14 @@ def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str
             P_VALUE: Cell(each.p_value),
         }
         rows.append(row)
-    return rows, heading, f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")
+    small = margin(metric, runs)
+    least = factor * float(np.median([least_difference(each.mean, small) for each in compared]))
+    agreements = [agreement_of_halves(each.signs, each.probability.count) for each in compared]
+    stable = sum(each >= MIN_AGREEMENT for each in agreements)
+    shown = [f"{each:.2g} {unit}".removesuffix(" 1") for each in (factor * small, least)]
+    if np.isnan(least):
+        shown[1] = ""
+    return rows, heading, shown[0], shown[1], stable
 
 
 def _median(values: pd.Series[float]) -> Estimate:

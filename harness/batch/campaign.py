@@ -33,10 +33,11 @@ from servobench.harness.batch.differences import check_same_batch
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
 from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.lock import check_empty, is_unused, locked
+from servobench.harness.batch.looks import Looks
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.results import Manifest, ResultsFolder, load_runs
+from servobench.harness.batch.results import Manifest, ResultsFolder, load_runs, wanted_runs
 from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings
@@ -69,6 +70,7 @@ class Campaign:
     steps: bool = False  # keep the table of steps, too
     timed: bool = False  # each run goes by itself, so that its steps have times
     metrics: tuple[str, ...] = ()  # names of metrics of users; each run goes by itself, too
+    looks: Looks | None = None  # when it may end before all runs; None for a fixed number
 
 
 def comparison(batch: Batch, settings: Settings) -> Campaign:
@@ -182,7 +184,13 @@ def _carry_out_at(
         _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
     )
     manifest = describe_batch(
-        runs, sections, campaign.settings.sections, side_by_side, own, steps=campaign.steps
+        runs,
+        sections,
+        campaign.settings.sections,
+        side_by_side,
+        own,
+        steps=campaign.steps,
+        until_decided=campaign.looks.record if campaign.looks else None,
     )
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
@@ -198,12 +206,15 @@ def _carry_out_at(
             if how.resume:
                 how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
             store.create_folder(folder, manifest)
-        if not resumed or not opened.is_whole(runs.count):
+        if not resumed or not opened.is_whole(wanted_runs(manifest)):
             for block, outcome in _carry_out_missing(campaign, jobs, own, opened, place, how):
                 with writing(folder):
                     lock.check()  # the folder may have been removed
                 store.write_part(folder, block.jobs[0].index, outcome, manifest["campaign"])
                 how.observer.finished([result.row for result in outcome])
+            if campaign.looks and how.part == (1, 1):
+                manifest["until_decided"]["runs"] = sum(map(len, opened.finished_runs()))
+                store.write_manifest(folder, manifest)
         store.put_together(opened, manifest)
 
 
@@ -211,6 +222,7 @@ def _resume(folder: ResultsFolder, manifest: Manifest, observer: Observer) -> No
     """Refuse a folder of another batch, and mend one of this batch before anything is computed."""
     restored = restore_manifest(folder, manifest)
     check_same_batch(folder, manifest, observer.note, remedy="give another folder as `out`")
+    manifest["until_decided"] = folder.manifest.get("until_decided", {})
     mended = list(mend(folder, manifest))
     if restored:
         mended.insert(0, restored)
@@ -283,16 +295,35 @@ def _carry_out_missing(
     begin, end = (
         len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0])
     )
-    there = (range(max(each.start, begin), min(each.stop, end)) for each in folder.finished_runs())
-    done = list(filter(None, there))  # a block of another part may reach over the borders
-    missing = end - begin - sum(map(len, done))
-    how.observer.begin(end - begin, end - begin - missing)
-    ends = [range(begin, begin), *done, range(end, end)]
-    gaps = (range(one.stop, next_one.start) for one, next_one in pairwise(ends))
-    size = even_size(missing, place.count, how.block)
-    blocks = cut(jobs(chain.from_iterable(gaps)), size, 1 if campaign.steps else CHUNK, own)
+    ends = campaign.looks.ends if campaign.looks else (len(campaign.cells),)
     keep = folder.path if campaign.steps and not place.cluster else None
-    return carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
+    for start, stop in pairwise((0, *ends)):
+        own_share = range(max(start, begin), max(start, begin, min(stop, end)))
+        gaps, missing, done = _gaps(campaign, folder, own_share)
+        how.observer.begin(done + missing, done)
+        size = even_size(missing, place.count, how.block)
+        blocks = cut(jobs(gaps), size, 1 if campaign.steps else CHUNK, own)
+        yield from carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
+
+
+def _gaps(
+    campaign: Campaign, folder: ResultsFolder, share: range
+) -> tuple[Iterable[int], int, int]:
+    """Return the indices of the missing runs of a share, their number, and that of those in the folder."""
+    there = (
+        range(max(each.start, share.start), min(each.stop, share.stop))
+        for each in folder.finished_runs()
+    )
+    done = list(filter(None, there))  # a block of another part may reach over the borders
+    finished = sum(map(len, done))
+    ends = [range(share.start, share.start), *done, range(share.stop, share.stop)]
+    gaps = chain.from_iterable(range(one.stop, next_one.start) for one, next_one in pairwise(ends))
+    if campaign.looks is None:
+        return gaps, len(share) - finished, finished
+    runs = folder.runs(parts=True) if folder.part_indices() else pd.DataFrame()
+    is_needed = campaign.looks.goes_on(runs)
+    needed = [index for index in gaps if is_needed(campaign.cells[index].request)]
+    return needed, len(needed), finished
 
 
 def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: bool) -> None:

@@ -16,6 +16,7 @@ from servobench.harness.batch.results import (
     Manifest,
     ResultsFolder,
     part_name,
+    wanted_runs,
 )
 from servobench.harness.batch.schema import MANIFEST, OtherSchema
 from servobench.harness.batch.store import write_manifest
@@ -115,7 +116,7 @@ def examine(folder: ResultsFolder) -> Examination:
             findings.append(Finding(name, wrong, REMADE))
     left_out = [name for name in folder.unlisted() if name not in names and name != MANIFEST]
     return Examination(
-        findings, len(names) + 1 + len(beside), count, manifest.get("run_count", 0), left_out
+        findings, len(names) + 1 + len(beside), count, wanted_runs(manifest), left_out
     )
 
 
@@ -164,7 +165,7 @@ def mend(folder: ResultsFolder, manifest: Manifest) -> Iterator[str]:
         for left in (*path.glob(".*"), *(path / PARTS).glob(".*")):
             if PARTIAL.fullmatch(left.name):  # by a process that was killed
                 left.unlink()
-        if not folder.is_whole(manifest["run_count"]):
+        if not folder.is_whole(wanted_runs(manifest)):
             (path / PARTS).mkdir(exist_ok=True)
             return
         if FAILURES in kept and (wrong := folder.fault_of(FAILURES)):

@@ -58,6 +58,7 @@ def describe_batch(
     own: Sequence[Offer] = (),
     *,
     steps: bool = False,
+    until_decided: Mapping[str, Any] | None = None,
 ) -> Manifest:
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
@@ -68,11 +69,14 @@ def describe_batch(
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
         own: controllers, plants, tasks and metrics that users gave.
         steps: the table of steps is kept, too.
+        until_decided: what is asked of a batch that ends when that is decided.
     """
     configuration = {name: flatten(config) for name, config in sections.items()}
     commit, unknown = read_checkout()
     metrics = {each.name: each.entry.record() for each in own if isinstance(each.entry, OwnMetric)}
     parts = [runs.digest, configuration, steps, *sorted(metrics)]
+    if until_decided:
+        parts.append(until_decided)
     identity = json.dumps(parts, sort_keys=True, default=str)
     given: dict[str, dict[str, Any]] = {key: {} for key in OWN.values()}
     for offer in own:
@@ -109,6 +113,7 @@ def describe_batch(
         "git_commit_unknown": unknown,
         "side_by_side": dict(side_by_side),
         "run_count": runs.count,
+        "until_decided": dict(until_decided or {}),
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),
     }
 

@@ -9,7 +9,7 @@ refused by name: `SHA256SUMS` has the checksums of all of them.
 import contextlib
 import os
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, TypeAlias, final
@@ -36,6 +36,9 @@ PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 FAILURES = "failures.log"
+STOPPED: Final = (
+    "runs ended when they were decided: intervals and p-values are for a fixed number of seeds"
+)
 PART: Final = re.compile(
     rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})"
 )
@@ -44,6 +47,12 @@ PART: Final = re.compile(
 def part_name(index: int, kind: str) -> str:
     """Return the name within a results folder of a file of the part that begins with the run `index`."""
     return f"{PARTS}/{index:08d}.{kind}"
+
+
+def wanted_runs(manifest: Mapping[str, Any]) -> int:
+    """Return the number of runs of a batch, or of those that decided it; 0 where its manifest does not tell."""
+    decided = manifest.get("until_decided", {}).get("runs")
+    return int(decided or manifest.get("run_count", 0))
 
 
 def missing_line(count: int, wanted: int) -> str:
@@ -89,23 +98,26 @@ class ResultsFolder:
 
     @property
     def run_count(self) -> int:
-        """The number of runs of the whole batch; 0 where the manifest does not tell."""
-        return int(self.manifest.get("run_count", 0))
+        """The number of runs of the batch, or of those that decided it; 0 where the manifest does not tell."""
+        return wanted_runs(self.manifest)
 
     @property
     def configuration(self) -> dict[str, dict[str, Any]]:
         """The settings of the runs by section and name; empty where the manifest has none."""
         return dict(self.manifest.get("configuration", {}))
 
-    def runs(self) -> pd.DataFrame:
+    def runs(self, *, parts: bool = False) -> pd.DataFrame:
         """Return the table of runs, also of a batch that was killed.
+
+        Args:
+            parts: read the parts, of which there may be more than an earlier table holds.
 
         Raises:
             ConfigurationError: not a results folder, one of another schema, a file of it is damaged, the table lacks
                 a column that says which run a row is, or a run's identifier is unfit for the name of a file.
         """
         self.check_finished()
-        names = self._intact(RUNS)
+        names = self.part_names(RUNS) if parts else self._intact(RUNS)
         runs = tables.read_tables(self.path, names)
         first = self.path / names[0]
         refuse_lacking(first, "runs", tables.common_schema(self.path, names))
@@ -188,6 +200,8 @@ class ResultsFolder:
         self.check_finished()
         count = sum(tables.row_count(self.path, name) for name in self._intact(RUNS))
         lines = [missing_line(count, self.run_count)]
+        if self.manifest.get("until_decided"):
+            lines.append(STOPPED)
         if self.sums is None:
             lines.append(f"{SUMS} is missing, so that nothing vouches for the tables")
         return "; ".join(filter(None, lines))

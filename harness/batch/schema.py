@@ -17,7 +17,7 @@ CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s 
 ENTRIES: Final[dict[tuple[type, ...], tuple[str, ...]]] = {
     (str,): ("created", "python", "platform", "campaign", "seeds"),
     (int,): ("run_count",),
-    (dict,): ("changed", "packages", "engines"),
+    (dict,): ("changed", "packages", "engines", "until_decided"),
     (list, str): ("plants", "controllers", "tasks", "mismatches"),
     (list, dict): ("robots", "blas"),
     (dict, str): ("files",),

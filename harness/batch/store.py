@@ -22,6 +22,7 @@ from servobench.harness.batch.results import (
     Manifest,
     ResultsFolder,
     part_name,
+    wanted_runs,
 )
 from servobench.harness.batch.schema import MANIFEST, encode
 from servobench.harness.batch.tables import writing
@@ -130,7 +131,7 @@ def collect(folder: ResultsFolder) -> int:
 def put_together(folder: ResultsFolder, manifest: Manifest) -> int:
     """Put the parts of a folder with this manifest together; result and errors are those of `collect`."""
     path = folder.path
-    wanted = manifest.get("run_count", 0)
+    wanted = wanted_runs(manifest)
     if folder.is_whole(wanted):  # at most the clean-up is left
         shutil.rmtree(path / PARTS, ignore_errors=True)
         return tables.row_count(path, RUNS)

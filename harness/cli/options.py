@@ -217,6 +217,16 @@ MetricsOption = Annotated[
         "--metric", "PLACE", "A metric of yours, such as ./mine.py:itae; may be repeated."
     ),
 ]
+UntilDecidedOption = Annotated[
+    bool,
+    switch(
+        "--until-decided",
+        "Look after every 16 seeds; end when each pair is better, worse or equivalent, or --seeds are spent.",
+    ),
+]
+AgainstOption = Annotated[
+    str | None, option("NAME", "Only pairs with this controller, which is A in them.")
+]
 JsonOption = Annotated[bool, switch("--json", "Print JSON, for other programs.")]
 DebugOption = Annotated[
     bool,

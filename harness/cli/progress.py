@@ -216,7 +216,7 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
             done = max(done, sum(map(len, ResultsFolder(folder).finished_runs())))
         if done == 0:
             raise
-        kept = f"{done} of {observer.total} runs are finished and kept in {folder}"
+        kept = f"{done} of {max(done, observer.total)} runs are finished and kept in {folder}"
         end_interrupted(kept, "the same call with --resume and this --out continues")
     finally:
         observer.close()

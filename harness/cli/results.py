@@ -11,6 +11,7 @@ import typer
 
 from servobench.harness.cli import selection
 from servobench.harness.cli.options import (
+    AgainstOption,
     JsonOption,
     NamesOption,
     ShownOption,
@@ -47,9 +48,7 @@ def statistics(
     ] = None,
     controllers: ShownOption = "all",
     names: NamesOption = "",
-    against: Annotated[
-        str | None, option("NAME", "Only pairs with this controller, which is A in them.")
-    ] = None,
+    against: AgainstOption = None,
     markdown: Annotated[bool, switch("--markdown", "Print the tables as Markdown.")] = False,
     latex: Annotated[
         bool,
@@ -68,6 +67,7 @@ def statistics(
     from servobench.harness.analysis.tables import Selection, as_plain, judge_places
     from servobench.harness.batch.measuring import add_metric
     from servobench.harness.batch.results import ResultsFolder
+    from servobench.harness.cli.deciding import print_stored
     from servobench.harness.config.source import find_place
     from servobench.plant.contract.settings import suggest
 
@@ -112,6 +112,7 @@ def statistics(
     else:
         print_tables(found.tables())
     say(found.legend)
+    print_stored(opened)
     say_methods(opened.manifest, labels)
 
 

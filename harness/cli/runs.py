@@ -26,6 +26,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest
 
 if TYPE_CHECKING:
+    from servobench.harness.analysis.decisions import Question
     from servobench.harness.batch.campaign import Campaign, Execution
 
 DEFAULT_CONTROLLER = "ukf_mfac"  # controller of a run for which none is named
@@ -120,6 +121,8 @@ def compare(
         str,
         option("PLANTS", "Further plants, for the first seed only: bullet, for its pictures."),
     ] = "",
+    until_decided: options.UntilDecidedOption = False,
+    against: options.AgainstOption = None,
     metric: options.MetricsOption = None,
     running: options.Batched,
     overrides: options.RunOverrides,
@@ -129,6 +132,7 @@ def compare(
 ) -> None:
     """Compare controllers: run every combination."""
     from servobench.harness.batch.campaign import comparison
+    from servobench.harness.cli.deciding import ask, ending_when_decided
 
     batch = combinations.batch()
     if first_seed_on:
@@ -138,6 +142,12 @@ def compare(
         raise ConfigurationError("--resume needs --out, the folder to continue in")
     metrics = selection.choose_metrics(metric)
     campaign = replace(comparison(batch, overrides.settings()), metrics=metrics)
+    worlds = len(batch.requests()) // (len(batch.controllers) * len(batch.seeds))
+    question = ask(
+        until_decided, against, batch.controllers, worlds, batch.seeds, first_seed_on=first_seed_on
+    )
+    if question is not None:
+        campaign = ending_when_decided(campaign, question)
     how = running.execution()
     _carry_out(
         campaign,
@@ -146,6 +156,7 @@ def compare(
         with_figures=with_figures,
         with_report=with_report,
         strict=running.strict,
+        question=question,
     )
 
 
@@ -270,8 +281,10 @@ def _carry_out(
     with_figures: bool,
     with_report: bool,
     strict: bool,
+    question: Question | None = None,
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
+    from servobench.harness.analysis.decisions import decide_worlds
     from servobench.harness.analysis.folder import (
         mark_tuned,
         titled_runs,
@@ -280,6 +293,7 @@ def _carry_out(
     from servobench.harness.analysis.verdict import judge as find_verdict
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.batch.results import ResultsFolder
+    from servobench.harness.cli.deciding import print_decisions, save_decisions
     from servobench.harness.cli.progress import watching
     from servobench.harness.config.installation import missing_extra
 
@@ -292,6 +306,8 @@ def _carry_out(
         print_tables(summary_tables(shown), summary_legend(runs))
         say_methods(opened.manifest)
         print_faults(opened, runs)
+        if question is not None:
+            save_decisions(opened, decide_worlds(runs, question))
         if out is None:
             point_latest(folder)
         if with_figures:
@@ -315,7 +331,9 @@ def _carry_out(
                     missing_extra(error, "the page") if isinstance(error, ImportError) else None
                 )
                 say(f"no report: {missing or error}")
-        if len(runs) > 1:
+        if question is not None:
+            print_decisions(opened, question, len(campaign.cells))
+        elif len(runs) > 1:
             finding = find_verdict(runs)
             say("\n".join(["", finding.result, *finding.cautions, ""]).replace("`", ""))
     judge(opened, strict=strict, whole=how.part == (1, 1))

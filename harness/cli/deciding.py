@@ -1,0 +1,99 @@
+"""Comparisons that end when they are decided: what is asked, the batch that ends, and what is printed of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import pandas as pd
+
+from servobench.harness.analysis.decisions import (
+    DECISIONS,
+    Question,
+    World,
+    decide_worlds,
+    decision_legend,
+    decision_rows,
+    decision_tables,
+    needed_after,
+)
+from servobench.harness.batch.campaign import Campaign
+from servobench.harness.batch.looks import Looks, in_looks
+from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.cli.terminal import print_tables, say
+from servobench.harness.run.request import RunRequest
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import write_csv
+
+
+def ask(
+    until_decided: bool,
+    against: str | None,
+    names: Sequence[str],
+    worlds: int,
+    seeds: Sequence[int],
+    *,
+    first_seed_on: str = "",
+) -> Question | None:
+    """Return what a command is to decide; None where it has a fixed number of seeds.
+
+    Raises:
+        ConfigurationError: options that do not go together, or too few methods or seeds.
+    """
+    if not until_decided:
+        if against is not None:
+            raise ConfigurationError(
+                "--against chooses the pairs of --until-decided; give both, or statistics --against afterwards"
+            )
+        return None
+    if first_seed_on:
+        raise ConfigurationError(
+            "--until-decided cannot judge plants with one seed; leave --first-seed-on away"
+        )
+    return Question.ask(names, against, worlds, seeds)
+
+
+def ending_when_decided(
+    campaign: Campaign,
+    question: Question,
+    decided: Callable[[pd.DataFrame, Question], list[World]] = decide_worlds,
+) -> Campaign:
+    """Return a campaign that ends when its question is decided.
+
+    Args:
+        campaign: with all runs of the budget.
+        question: what it is to decide.
+        decided: returns from the table of runs what is decided in each world.
+    """
+    cells, ends = in_looks(campaign.cells, question.seeds, question.looks)
+
+    def goes_on(runs: pd.DataFrame) -> Callable[[RunRequest], bool]:
+        worlds = [] if runs.empty else decided(runs, question)
+        return needed_after(worlds, question)
+
+    return replace(campaign, cells=cells, looks=Looks(ends, goes_on, question.record()))
+
+
+def save_decisions(folder: ResultsFolder, worlds: Sequence[World]) -> None:
+    """Write what is decided beside the tables of a folder."""
+    path = folder.path / DECISIONS
+    write_csv(decision_rows(worlds), path)
+    folder.vouch([path])
+
+
+def print_stored(folder: ResultsFolder) -> None:
+    """Print what was decided when a batch ended, if it was one that ends so."""
+    path = folder.path / DECISIONS
+    if folder.manifest.get("until_decided") and path.exists():
+        print_tables(decision_tables(pd.read_csv(path)))
+
+
+def print_decisions(folder: ResultsFolder, question: Question, budget: int) -> None:
+    """Print what is decided, and how many of the runs of the budget were saved."""
+    print_tables(decision_tables(pd.read_csv(folder.path / DECISIONS)), decision_legend(question))
+    rows = pd.read_csv(folder.path / DECISIONS)
+    decided = int((rows["verdict"] != "undecided").sum())
+    saved = budget - folder.run_count
+    say(
+        f"{decided} of {len(rows)} verdicts decided; {saved} of {budget} runs saved ({100 * saved / budget:.0f} %)"
+    )
