@@ -178,10 +178,10 @@ def identify(
             rows, nominal, lambda: {k: setup.nominal(find_robot(k)) for k in apart}
         )
         response = command_response(rows)
-        held = held_out(rows, nominal, found) if found else None
     if found is None:
         say(f"{name}: {mistake}")
         sys.exit(FAILED)
+    held = held_out(rows, nominal, found)
     print_tables(
         [(f"{name} against the nominal {own.title}, where they differ", estimates(found, response))]
     )

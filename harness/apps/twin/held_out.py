@@ -35,12 +35,13 @@ class HeldOut(NamedTuple):
 def held_out(log: Log, model: RobotModel, robot: Identified) -> HeldOut | None:
     """Return the errors in the last fifth of a log by the robot of the rest; None if that has too few frames.
 
+    Both parts take frames at the times that the whole log gives them.
+
     Args:
         log: rows of a robot with one fixed camera.
         model: nominal robot under the sensing of the log.
         robot: as identified from the whole log, where the search begins.
     """
-    # Both parts take frames at the times that the whole log gives them.
     clocks = log.clocks or Clocks(0.0, MAX_LATENCY, None)
     log = log._replace(captured=log.frame_time, clocks=clocks)
     rows = frames_of(log)

@@ -89,7 +89,7 @@ SWING_PERIODS: Final = np.geomspace(1.0, 20.0, 120)  # [s] tried in the search
 MIN_WAVE: Final = 25.0  # [1]
 MIN_SWINGS: Final = 3  # A log must be longer than this many periods of a swing.
 RIPPLE_ORDER: Final = MechanicsConfig().ripple_order
-ACCELERATION_SPAN: Final = 0.2  # [s] of rows from which an acceleration is taken
+ACCELERATION_SPAN: Final = 0.2  # [s] span of the rows from which an acceleration is taken
 MIN_CUBIC_ROWS: Final = 5
 MIN_PLAY: Final = 0.002  # [rad] play about which its effect is linearised
 # The log tells a parameter if its deviation grows less than this with a prior of twice the width.
@@ -611,7 +611,6 @@ class _Problem:
         if wave is None:
             return z
         pace, sizes, left = wave
-        # The best of many periods explains some of any noise, and with it what belongs to other parameters.
         if len(late) * (1.0 - left) > MIN_WAVE:
             self.pace = pace
             z[swings] = sizes / prior("swing")
