@@ -11,7 +11,7 @@ with some aids alone says so in its type, too: `Only`.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias
+from typing import Annotated, Any, Literal, NoReturn, TypeAlias
 
 from annotated_types import Le
 
@@ -128,9 +128,9 @@ class AidsConfig:
         return away != ("ignored", "ignored", "given", False, "own")
 
 
-SWITCHES: Final[Mapping[str, Switch]] = declared(AidsConfig, Switch)
+SWITCHES: Mapping[str, Switch] = declared(AidsConfig, Switch)
 """The aids by name."""
-RANGES: Final[Mapping[str, Tuned]] = declared(AidsConfig, Tuned)
+RANGES: Mapping[str, Tuned] = declared(AidsConfig, Tuned)
 """The numbers of the aids that are tuned, by name."""
 
 
@@ -149,9 +149,7 @@ class _Fixed(dict[str, Any]):
         return dict, (dict(self),)
 
 
-EQUIPPED: Final[Mapping[str, Any]] = _Fixed(
-    {name: switch.equipped for name, switch in SWITCHES.items()}
-)
+EQUIPPED: Mapping[str, Any] = _Fixed({name: switch.equipped for name, switch in SWITCHES.items()})
 """The value of each aid in a best equipped method."""
 
 

@@ -9,7 +9,7 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 
 from abc import ABC, abstractmethod
 from math import ceil
-from typing import Annotated, Any, Final, Generic, Literal, NamedTuple, TypeVar, final
+from typing import Annotated, Any, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +23,8 @@ from servobench.plant.contract.lanes import branch, pick
 from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
-MIN_FEATURES: Final = (
-    3  # number of features that end a rest after its time where frames are lost or slow
-)
-MIN_MOVED_SHARE: Final = 0.1  # [1] least singular value of ΔQ in probing moves
+MIN_FEATURES = 3  # number of features that end a rest after its time where frames are lost or slow
+MIN_MOVED_SHARE = 0.1  # [1] least singular value of ΔQ in probing moves
 State = TypeVar("State")
 IntArray = npt.NDArray[np.int_]
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import ControllerEntry, RobotKnowledge
@@ -92,7 +92,7 @@ LAWS: dict[str, Part[Law[Any]]] = {
     "rbfnn": Part(RbfnnConfig, RbfnnLaw, trained=True),
 }
 
-PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed
+PUBLISHED = ":published"  # after the name of a method: without aids, its law as printed
 
 
 @dataclass(frozen=True)

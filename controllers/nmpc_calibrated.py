@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Annotated, Any, Final, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import numpy as np
 
@@ -28,9 +28,9 @@ from servobench.plant.contract.settings import (
 )
 from servobench.plant.contract.signals import Command, Observation
 
-_PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
+_PLAN_TOLERANCE = 1e-9  # [rad] a smaller change of the plan ends the iterations
 # Number of exposures in a control period that are considered where frames are late by unknown times.
-AGES: Final = 4
+AGES = 4
 
 
 @settings

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final, cast, final
+from typing import Any, cast, final
 
 from servobench.controllers.controller import (
     Controller,
@@ -18,8 +18,8 @@ from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import NonNegative, override, settings
 from servobench.plant.contract.signals import Command, Observation
 
-UNKNOWING: Final = "regression_mfac"
-KNOWING: Final = "calibrated"
+UNKNOWING = "regression_mfac"
+KNOWING = "calibrated"
 
 
 @settings
@@ -101,7 +101,7 @@ def _method(name: str, knowledge: RobotKnowledge) -> ServoController:
     return cast(ServoController, entry.build(config, knowledge))
 
 
-ENTRY: Final = ControllerEntry(
+ENTRY = ControllerEntry(
     "revealed",
     "regression_mfac until 0.2 s, then calibrated: a bound of what learning within a run can reach",
     RevealedConfig,

@@ -4,15 +4,14 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
 
 from servobench.plant.fmu.dialect import FMI2, FMI3, FmiDialect
 
 # Parts of the model structure.
-OUTPUTS: Final = "outputs"
-DERIVATIVES: Final = "derivatives"
-INITIAL_UNKNOWNS: Final = "initial unknowns"
-INDICATORS: Final = "event indicators"
+OUTPUTS = "outputs"
+DERIVATIVES = "derivatives"
+INITIAL_UNKNOWNS = "initial unknowns"
+INDICATORS = "event indicators"
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,8 @@ class ExportDialect:
     exchange: Mapping[str, str] = field(default_factory=dict)
 
 
-_TABLES: Final = tomllib.loads(Path(__file__).with_name("dialect.toml").read_text(encoding="utf-8"))
-EXPORTS: Final = {
-    names.version: ExportDialect(names, **_TABLES[names.prefix]) for names in (FMI2, FMI3)
-}
+_TABLES = tomllib.loads(Path(__file__).with_name("dialect.toml").read_text(encoding="utf-8"))
+EXPORTS = {names.version: ExportDialect(names, **_TABLES[names.prefix]) for names in (FMI2, FMI3)}
 
 
 def export_dialect(fmi_version: int) -> ExportDialect:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -26,8 +25,8 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
 CORE = "kinematics"
-PACKAGES: Final = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
-SOURCES: Final = {
+PACKAGES = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
+SOURCES = {
     ".py",
     ".pyc",
     ".c",
@@ -36,7 +35,7 @@ SOURCES: Final = {
     ".txt",
     ".csv",
 }  # .pyc of an installation without .py
-STEP: Final = 0.05  # [s] step of the default experiment
+STEP = 0.05  # [s] step of the default experiment
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
 

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
 from uuid import UUID
 
 from servobench.fmus.compiler import Platform, compile_library, library_files
@@ -30,11 +29,11 @@ from servobench.fmus.sources import layout_header
 from servobench.fmus.variables import Layout
 from servobench.plant.contract.files import accessing, write_atomically
 
-MACHINERY: Final = "fmi"  # folder of the FMI functions, which serve every model
-ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
-UNIX: Final = 3  # system of an entry in a zip archive, which says how its mode is to be read
-PLACEHOLDER: Final = "{token}"
-RELATED_FILES: Final = (
+MACHINERY = "fmi"  # folder of the FMI functions, which serve every model
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
+UNIX = 3  # system of an entry in a zip archive, which says how its mode is to be read
+PLACEHOLDER = "{token}"
+RELATED_FILES = (
     (
         INPUT_FILE,
         "testcase",

@@ -14,7 +14,7 @@ from functools import cached_property
 from importlib.resources import files
 from itertools import accumulate, product
 from math import prod
-from typing import Final, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -26,28 +26,28 @@ from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
 
-ARM: Final = "ur5_mismatched"  # folder of the model that serves every arm
+ARM = "ur5_mismatched"  # folder of the model that serves every arm
 # Roles of variables.
-PARAMETER: Final = "parameter"
-FIXED: Final = "fixed parameter"
-INPUT: Final = "input"
-STATE: Final = "state"
-DERIVATIVE: Final = "derivative"
-INDICATOR: Final = "event indicator"
-OUTPUT: Final = "output"
-SAMPLED: Final = "sampled output"
+PARAMETER = "parameter"
+FIXED = "fixed parameter"
+INPUT = "input"
+STATE = "state"
+DERIVATIVE = "derivative"
+INDICATOR = "event indicator"
+OUTPUT = "output"
+SAMPLED = "sampled output"
 
 # Settings of the mechanics: of each joint, and of the tool.
-GEARS: Final = ("backlash", "ripple", "ripple_order")
-TOOL: Final = ("tool_frequency", "tool_damping")
+GEARS = ("backlash", "ripple", "ripple_order")
+TOOL = ("tool_frequency", "tool_damping")
 
 # Parts of the generated core.
-ARGUMENT: Final = "argument"
-RESULT: Final = "result"
+ARGUMENT = "argument"
+RESULT = "result"
 
-FEATURE: Final = "feature"
-BALL: Final = "ball_position"  # name of the feature without a set-up of cameras
-SEEN: Final = "seen"
+FEATURE = "feature"
+BALL = "ball_position"  # name of the feature without a set-up of cameras
+SEEN = "seen"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ A weight of 0 leaves the row as it was. As b grows without limit all of them bec
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,8 +32,8 @@ from servobench.plant.contract.lanes import norm, outer, repeat
 from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
-MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is practically 0, but can be divided by
-MIN_ERROR: Final = 0.1  # [1] smallest |e| of the generalised kernel, in standard deviations
+MAX_EXPONENT = 40.0  # [1] a weight of exp(−40) is practically 0, but can be divided by
+MIN_ERROR = 0.1  # [1] smallest |e| of the generalised kernel, in standard deviations
 
 
 def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:

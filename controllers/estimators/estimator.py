@@ -6,7 +6,7 @@ no array of it is ever changed. One run has no leading axis; a thousand runs hav
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
@@ -14,7 +14,7 @@ from servobench.plant.contract.lanes import branch, norm
 
 State = TypeVar("State")
 # [s] Shortest motion at any control period, so that as much is learned per second.
-MOTION_TIME: Final = 0.05
+MOTION_TIME = 0.05
 
 
 @dataclass(frozen=True, eq=False, slots=True)

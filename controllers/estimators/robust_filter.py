@@ -24,7 +24,7 @@ Uncalibrated Visual Servoing", ICRA 2010, there from a memory of motions; of a K
 Kalman Filter Based on a Generalized Maximum-Likelihood-Type Estimator", IEEE Trans. Signal Process. 58 (2010) 2509.
 """
 
-from typing import Final, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -35,14 +35,14 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, outer, where
 from servobench.plant.contract.settings import NonNegative, settings
 
-BISQUARE: Final = 4.685  # [1] c_b: 95 % efficiency under normal noise
-NORMAL_MEDIAN: Final = 0.6745  # [1] median of |N(0, 1)|
-IRLS_STEPS: Final = 5  # number of re-weightings of a measurement
-SCALE_RATE: Final = 1.0  # [1/s] at which ln s rises or sinks
-MAX_SCALE: Final = 1e3  # [1] largest s
-REJECTION_WEIGHT: Final = 0.01  # [1] a smaller weight is a rejection
-MEMORY: Final = 1.0  # [s] time constant with which rejections are forgotten
-LOST_SHARE: Final = 0.7  # [1] share of rejections above which a feature is reset to its measurement
+BISQUARE = 4.685  # [1] c_b: 95 % efficiency under normal noise
+NORMAL_MEDIAN = 0.6745  # [1] median of |N(0, 1)|
+IRLS_STEPS = 5  # number of re-weightings of a measurement
+SCALE_RATE = 1.0  # [1/s] at which ln s rises or sinks
+MAX_SCALE = 1e3  # [1] largest s
+REJECTION_WEIGHT = 0.01  # [1] a smaller weight is a rejection
+MEMORY = 1.0  # [s] time constant with which rejections are forgotten
+LOST_SHARE = 0.7  # [1] share of rejections above which a feature is reset to its measurement
 
 
 @settings

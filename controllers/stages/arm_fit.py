@@ -23,7 +23,7 @@ last ones, and of older ones a set that is thinned evenly.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, TypeAlias, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -35,22 +35,22 @@ from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
 
-FRAMES: Final = 160  # rows of the buffer
-KEPT: Final = 96  # frames that are kept; all rows are used where frames are late, as each of them tells less then
-RECENT: Final = 36  # the last of them, which are not thinned
-LONGEST: Final = 0.55  # [s] longest latency that is considered
-GRID: Final = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
+FRAMES = 160  # rows of the buffer
+KEPT = 96  # frames that are kept; all rows are used where frames are late, as each of them tells less then
+RECENT = 36  # the last of them, which are not thinned
+LONGEST = 0.55  # [s] longest latency that is considered
+GRID = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
 # Sizes of random deviations at which members begin, in four classes
-SPREADS: Final = {
+SPREADS = {
     "zero": (0.05, 0.4, 1.0, 2.5),  # [rad]
     "gear": (0.01, 0.1, 0.3, 0.4),  # [1]
     "tool": (0.01, 0.05, 0.15, 0.2),  # [m]
     "target": (0.01, 0.05, 0.15, 0.2),  # [m]
     "link": (0.03, 0.05, 0.15, 0.3),  # [1]
 }
-DRAWS: Final = 2048  # rows of their table
-GEARS: Final = ("play", "ripple")  # b and a [rad], the last entries of θ
-CORES: Final = {
+DRAWS = 2048  # rows of their table
+GEARS = ("play", "ripple")  # b and a [rad], the last entries of θ
+CORES = {
     "zero": 0.08,
     "gear": 0.02,
     "tool": 0.02,
@@ -61,26 +61,26 @@ CORES: Final = {
 }
 """a_i, cores of the Cauchy priors, in the same units."""
 # [1], [rad] largest deviations of a member
-LARGEST: Final = {"gear": 0.7, "link": 0.8, "play": 0.1, "ripple": 0.1}
-RIPPLE_ORDER: Final = 8.0  # k [1], periods of the ripple in a turn
-ASSUMED_PLAY: Final = 0.002  # [rad] b by which x moves while less is fitted
-LATENCY: Final = (0.1, 0.3)  # [s] L₀ and σ_L
+LARGEST = {"gear": 0.7, "link": 0.8, "play": 0.1, "ripple": 0.1}
+RIPPLE_ORDER = 8.0  # k [1], periods of the ripple in a turn
+ASSUMED_PLAY = 0.002  # [rad] b by which x moves while less is fitted
+LATENCY = (0.1, 0.3)  # [s] L₀ and σ_L
 # [s] between which it lies. Encoders may be late themselves, by a little: with more, a camera that turns and a frame
 # that is early look alike on a steady circle.
-LATENCIES: Final = (-0.02, LONGEST - 0.05)
-TURNING: Final = 0.05  # [rad/s] σ_ω
-STUDENT: Final = 8.0  # c [1]
-MEDIAN_SQUARE: Final = 2.366  # median of the squared length of three normal variables
-PLACE: Final = 1.0  # [m] prior deviation of the camera's place
-FLOOR: Final = 0.3e-3  # [m] least σ, in natural units
-FIRST_DAMPING: Final = 1e-2  # [1] λ
-DAMPING_FACTORS: Final = (0.2, 8.0)  # [1] of λ after a step that is made, and one that is not
-DAMPINGS: Final = (1e-6, 1e4)  # [1] between which λ lies
-ANNEALED: Final = 6  # iterations in which the noise of new members falls to its true size
-MAX_ZERO_STEP: Final = 0.7  # [rad] largest change of a zero in an iteration
+LATENCIES = (-0.02, LONGEST - 0.05)
+TURNING = 0.05  # [rad/s] σ_ω
+STUDENT = 8.0  # c [1]
+MEDIAN_SQUARE = 2.366  # median of the squared length of three normal variables
+PLACE = 1.0  # [m] prior deviation of the camera's place
+FLOOR = 0.3e-3  # [m] least σ, in natural units
+FIRST_DAMPING = 1e-2  # [1] λ
+DAMPING_FACTORS = (0.2, 8.0)  # [1] of λ after a step that is made, and one that is not
+DAMPINGS = (1e-6, 1e4)  # [1] between which λ lies
+ANNEALED = 6  # iterations in which the noise of new members falls to its true size
+MAX_ZERO_STEP = 0.7  # [rad] largest change of a zero in an iteration
 # Rows that a spline needs, counted from the last one before an instant
-SUPPORT: Final = np.array([-1, 0, 1, 2])
-ROWS: Final = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
+SUPPORT = np.array([-1, 0, 1, 2])
+ROWS = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
 
 
 class Frames(NamedTuple):

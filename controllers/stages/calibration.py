@@ -12,7 +12,7 @@ best of many new arms. With more frames there are fewer members, so that the wor
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -49,45 +49,41 @@ from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
-FIRST_MEMBERS: Final = 32  # members at first
-SEARCHED: Final = 16  # least number of members until `SEARCH_TIME`
-MEMBERS: Final = 3  # members at last
-WORK: Final = 240  # product of members and frames that is not exceeded by more
-SEARCH_TIME: Final = (
+FIRST_MEMBERS = 32  # members at first
+SEARCHED = 16  # least number of members until `SEARCH_TIME`
+MEMBERS = 3  # members at last
+WORK = 240  # product of members and frames that is not exceeded by more
+SEARCH_TIME = (
     1.5  # [s] until which members that do not explain the frames are searched for an arm that does
 )
-SEARCH_ITERATIONS: Final = 8  # their iterations from frame to frame
-ITERATION_INTERVAL: Final = 2  # frames from one iteration to the next, once all are explained
-MIN_MOTION: Final = 5.0  # [1] motion of a feature, in σ, before anything is fitted
-NOISE: Final = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
-BIAS_TIME: Final = 0.4  # [s] over which the residuals' mean is taken
-HORIZON: Final = 2  # frames
+SEARCH_ITERATIONS = 8  # their iterations from frame to frame
+ITERATION_INTERVAL = 2  # frames from one iteration to the next, once all are explained
+MIN_MOTION = 5.0  # [1] motion of a feature, in σ, before anything is fitted
+NOISE = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
+BIAS_TIME = 0.4  # [s] over which the residuals' mean is taken
+HORIZON = 2  # frames
 # [1] shares of the errors that are kept from frame to frame: with few frames, which change much, and with many
-MEMORIES: Final = (0.6, 0.9)
-MAX_ERROR: Final = 12.0  # [1] largest error that counts, in σ
-GATE: Final = 0.9  # [1] below 1: errors of both are limited, so that two bad predictions are equal
-HYSTERESIS: Final = (0.8, 1.25)  # [1] factors of the gate before and while the arm is used
-MANY_FRAMES: Final = 40
-KNOWN_GATE: Final = 2.0  # [1] factor of the gate where all frames are explained
-MIN_TRAVEL: Final = 2.0  # [rad] motion of all joints before it is
-EXPLAINED: Final = 1.3  # [1] residuals in σ up to which frames are explained
-LEAST_LATENESS: Final = 0.012  # [s] below which there is none
-FAST: Final = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
-MOVE_ERROR: Final = 3.0  # [1] error of a frame in σ from which on it tells a moved camera
-UNEXPLAINED: Final = 1.6  # [1] residuals in σ from which on new members are tried
-LAST_TRIAL: Final = 30.0  # [s]
-MIN_EXPONENT: Final = -100.0  # exponent of a weight: its square does not underflow
-MIN_TOTAL: Final = 1e-12  # [1] sum of weights by which they are divided
-CANDIDATES: Final = 8  # new members that are tried at once
-SCREENED: Final = 256  # new members at most of which these are the best, before any iteration
-SCREENING_WORK: Final = 4096  # product of them and frames that is not exceeded
-SCREENING: Final = (
-    25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
-)
-TRIAL_ITERATIONS: Final = 12  # iterations of a trial
-TRIAL_WORK: Final = (
-    960  # product of candidates, frames and iterations at a frame that is not exceeded
-)
+MEMORIES = (0.6, 0.9)
+MAX_ERROR = 12.0  # [1] largest error that counts, in σ
+GATE = 0.9  # [1] below 1: errors of both are limited, so that two bad predictions are equal
+HYSTERESIS = (0.8, 1.25)  # [1] factors of the gate before and while the arm is used
+MANY_FRAMES = 40
+KNOWN_GATE = 2.0  # [1] factor of the gate where all frames are explained
+MIN_TRAVEL = 2.0  # [rad] motion of all joints before it is
+EXPLAINED = 1.3  # [1] residuals in σ up to which frames are explained
+LEAST_LATENESS = 0.012  # [s] below which there is none
+FAST = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
+MOVE_ERROR = 3.0  # [1] error of a frame in σ from which on it tells a moved camera
+UNEXPLAINED = 1.6  # [1] residuals in σ from which on new members are tried
+LAST_TRIAL = 30.0  # [s]
+MIN_EXPONENT = -100.0  # exponent of a weight: its square does not underflow
+MIN_TOTAL = 1e-12  # [1] sum of weights by which they are divided
+CANDIDATES = 8  # new members that are tried at once
+SCREENED = 256  # new members at most of which these are the best, before any iteration
+SCREENING_WORK = 4096  # product of them and frames that is not exceeded
+SCREENING = 25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
+TRIAL_ITERATIONS = 12  # iterations of a trial
+TRIAL_WORK = 960  # product of candidates, frames and iterations at a frame that is not exceeded
 
 
 class Regressed(NamedTuple):

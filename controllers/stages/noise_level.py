@@ -12,19 +12,19 @@ guess pass for certainty, nor an outlier for noise.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
 
-LOG_RATIOS: Final = np.log(2.0) * np.arange(-2, 8)  # [1] ln of σ_j relative to the guess
-LOG_DEVIATION: Final = 1.5  # [1] prior deviation of ln σ
-FORGETTING: Final = 0.99  # [1] f, what is left of the scores after a sample
-OUTLIER: Final = 0.1  # [unit of the feature] deviation of outliers
-OUTLIER_ODDS: Final = 4.6  # [1] −2 ln of the share of outliers, a tenth
-MIN_LOG_LIKELIHOOD: Final = -600.0  # [1] exp of less than −700 underflows
+LOG_RATIOS = np.log(2.0) * np.arange(-2, 8)  # [1] ln of σ_j relative to the guess
+LOG_DEVIATION = 1.5  # [1] prior deviation of ln σ
+FORGETTING = 0.99  # [1] f, what is left of the scores after a sample
+OUTLIER = 0.1  # [unit of the feature] deviation of outliers
+OUTLIER_ODDS = 4.6  # [1] −2 ln of the share of outliers, a tenth
+MIN_LOG_LIKELIHOOD = -600.0  # [1] exp of less than −700 underflows
 
 
 class NoiseLevel(NamedTuple):

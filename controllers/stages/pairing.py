@@ -28,7 +28,7 @@ import math
 import operator
 from collections.abc import Iterable
 from functools import reduce
-from typing import Final, NamedTuple, Self, final
+from typing import NamedTuple, Self, final
 
 import numpy as np
 import numpy.typing as npt
@@ -54,27 +54,27 @@ from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
 # A motion over lost frames teaches nothing if it is longer than this many motions of the least length.
-MAX_GAP: Final = 16
+MAX_GAP = 16
 # Candidate delays differ only by noise if the motion changes between neighbours by less than this share of the noise.
-MIN_CHANGE_RATIO: Final = 0.8  # [1]
+MIN_CHANGE_RATIO = 0.8  # [1]
 # A model error below this share of the noise cannot favour a wrong delay, so that a steady motion counts as well.
-MAX_BIAS_RATIO: Final = 0.25  # [1]
+MAX_BIAS_RATIO = 0.25  # [1]
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
-MAX_LATENESS: Final = 1.0  # [s] a larger change of the age of frames is one of the camera's clock
+MAX_LATENESS = 1.0  # [s] a larger change of the age of frames is one of the camera's clock
 # [s] by which the age that counts as not late follows that of a frame: 200 ppm of the least duration of a motion
-DRIFT_STEP: Final = 1e-5
-DOUBT_GATE: Final = 100.0  # [1] g
+DRIFT_STEP = 1e-5
+DOUBT_GATE = 100.0  # [1] g
 # A doubtful frame was false if ‖ν‖² of the motion past it is below this share of the ‖ν‖² of the motion to it.
-TAKE_BACK_RATIO: Final = 0.5  # [1]
+TAKE_BACK_RATIO = 0.5  # [1]
 # A motion since the anchor is doubtful no longer if it is longer than this many motions of the least length.
-MAX_DOUBTFUL_GAP: Final = 4
+MAX_DOUBTFUL_GAP = 4
 # w, random walk of an entry of M over the motion of the feature.
-MAP_LENGTH_WALK: Final = 0.1  # [1/√m]
-REST_DEVIATION: Final = 0.2  # [m/rad] prior deviation of an entry of E
-REST_WALK: Final = 0.1  # [m/rad/√rad] u, random walk of an entry of E
-UNEXPLAINED_SHARE: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
+MAP_LENGTH_WALK = 0.1  # [1/√m]
+REST_DEVIATION = 0.2  # [m/rad] prior deviation of an entry of E
+REST_WALK = 0.1  # [m/rad/√rad] u, random walk of an entry of E
+UNEXPLAINED_SHARE = 0.05  # [1] share of ‖x‖ that M and E do not explain
 # The prior deviation of an entry of M. Larger ones favour late delays while an arm speeds up.
-MAP_DEVIATION: Final = 0.55  # [1]
+MAP_DEVIATION = 0.55  # [1]
 
 
 @final

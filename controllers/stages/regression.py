@@ -33,7 +33,7 @@ All functions are pure; the axis of the filters follows the leading axes of runs
 """
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple, TypeAlias, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -46,27 +46,27 @@ from servobench.plant.contract.lanes import Tree, branch, map_arrays, outer, pic
 from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
-GATE: Final = 10.0  # [1] g, the largest ‖ν‖²/s; the excess is taken for noise of the frame
+GATE = 10.0  # [1] g, the largest ‖ν‖²/s; the excess is taken for noise of the frame
 # [1] Largest lead of one filter in −2 ln likelihood, so that another can come back after a change.
-LEAD_CAP: Final = 100.0
+LEAD_CAP = 100.0
 # The filters of this number of runs side by side are updated at once, and all of these if a single one learns.
-PIECE: Final = 32
-REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
-MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
+PIECE = 32
+REST_DRIFT = 4.472136e-4  # [m/√s] walk of the feature at rest, r
+MIN_MOTION = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
 # After this number of successive frames that do not fit but agree with each other, the camera was moved.
-MOVED_FRAMES: Final = 3
+MOVED_FRAMES = 3
 # A frame agrees with the one before if ‖ν − e‖² is below this share of ‖ν‖².
-AGREEMENT: Final = 0.25  # [1]
+AGREEMENT = 0.25  # [1]
 # [m/rad] prior deviation of an entry of E; [m/rad/rad] that of H
-DEVIATIONS: Final = np.array([0.01, 0.01, 0.1, 0.4])
-PRIOR: Final = np.array([0.0, 6.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
-MODEL_ERROR: Final = 0.02  # [m/rad] c, deviation of the unexplained motion
+DEVIATIONS = np.array([0.01, 0.01, 0.1, 0.4])
+PRIOR = np.array([0.0, 6.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
+MODEL_ERROR = 0.02  # [m/rad] c, deviation of the unexplained motion
 # [1/√rad] random walk of an entry of E or H, as a share of its prior deviation
-WALK: Final = np.array([0.0, 0.0, 0.1, 0.1])
+WALK = np.array([0.0, 0.0, 0.1, 0.1])
 # Random walk of an entry of M over the motion of the joints, in each filter.
-MAP_TURN_WALKS: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad]
+MAP_TURN_WALKS = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad]
 # [1] ς, deviation of an entry of M from the nearest rotation; filters beyond these have any M
-ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])
+ROTATION_DEVIATIONS = np.array([0.1, 0.1, 0.3])
 
 
 class Innovation(NamedTuple):

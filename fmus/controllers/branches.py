@@ -5,7 +5,7 @@ be left in its middle: it goes on, and returns the code of a fault beside its re
 """
 
 from collections.abc import Callable
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from servobench.fmus.controllers.program import BREAK, COPY, FAULT, MERGE, WAY, 
 from servobench.plant.contract.lanes import map_arrays, take
 
 Tree = TypeVar("Tree")
-NOT_FINITE: Final = 1  # code of a fault: the estimate or the command is not finite
-NOT_DEFINITE: Final = 2  # likewise: a covariance is not positive definite
+NOT_FINITE = 1  # code of a fault: the estimate or the command is not finite
+NOT_DEFINITE = 2  # likewise: a covariance is not positive definite
 
 
 def note_fault(wrong: Any, code: int) -> None:  # noqa: ANN401 - an array of truth

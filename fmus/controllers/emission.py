@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,9 +33,9 @@ from servobench.fmus.controllers.program import (
 )
 
 # Share of an array up to which entries that are read after it is overwritten are kept elsewhere.
-KEPT_SHARE: Final = 0.3
-INPUTS: Final = "u"  # array of the caller that is never written to
-FILE: Final = """/* Generated from recorded numpy code; not meant to be edited. */
+KEPT_SHARE = 0.3
+INPUTS = "u"  # array of the caller that is never written to
+FILE = """/* Generated from recorded numpy code; not meant to be edited. */
 #include "controller.h"
 #include "linear_algebra.h"
 
@@ -43,7 +43,7 @@ FILE: Final = """/* Generated from recorded numpy code; not meant to be edited. 
 
 {functions}
 """
-FUNCTION: Final = """double {name}(double *x, const double *u, double *y)
+FUNCTION = """double {name}(double *x, const double *u, double *y)
 {{
 double fault = 0.0;
 {lines}

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -14,15 +13,15 @@ from servobench.fmus.reference import tables
 from servobench.fmus.variables import SAMPLED, Group, Layout, read_groups
 from servobench.plant.contract.checks import FloatArray
 
-MODEL: Final = "controller"
-CORE: Final = "controller"
+MODEL = "controller"
+CORE = "controller"
 # Names of the variables.
-POSITION: Final = "joint_position"
-FEATURE: Final = "feature"
-SEEN: Final = "seen"
-REFERENCE: Final = "reference"
-COMMAND: Final = "joint_velocity_command"
-JACOBIAN: Final = "jacobian"
+POSITION = "joint_position"
+FEATURE = "feature"
+SEEN = "seen"
+REFERENCE = "reference"
+COMMAND = "joint_velocity_command"
+JACOBIAN = "jacobian"
 
 
 def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]:

@@ -4,7 +4,7 @@ Linear algebra is that of `linear_algebra.h`; a matrix that LAPACK would refuse 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from servobench.fmus.controllers.arrays import (
 from servobench.fmus.controllers.branches import NOT_DEFINITE, note_fault
 from servobench.fmus.controllers.program import CALL, computed
 
-ARRANGES: Final = frozenset(
+ARRANGES = frozenset(
     {
         np.reshape, np.swapaxes, np.moveaxis, np.transpose, np.diagonal, np.repeat, np.broadcast_to, np.flip,
         np.squeeze, np.expand_dims, np.ravel, np.tile, np.roll, np.atleast_1d, np.atleast_2d, np.matrix_transpose,
@@ -283,7 +283,7 @@ def pseudo_inverse(a: Any) -> Traced:  # noqa: ANN401 - anything array-like
     return result
 
 
-FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
+FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     np.concatenate: _joining(np.concatenate), np.stack: _joining(np.stack),
     np.where: _where, np.take: _take, np.diff: _diff,
     np.zeros_like: _like(0.0), np.empty_like: _like(0.0), np.ones_like: _like(1.0), np.full_like: _full_like,

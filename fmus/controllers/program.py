@@ -10,29 +10,29 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 Places: TypeAlias = npt.NDArray[np.intp]
 
-NUMBERS: Final = "numbers"  # detail: the numbers
-INPUT: Final = "input"  # detail: name of the array of the caller
-MAP: Final = "map"  # entry by entry; detail: C with braces for the operands
-REDUCE: Final = "reduce"  # sums and the like over the last axes; detail: name of the ufunc
-JOIN: Final = "join"  # operands one after the other; detail: order in which they are read, if it is another one
-PUT: Final = "put"  # first operand, with the second one written to places; detail: these places
-COPY: Final = "copy"  # in an array of its own
-CALL: Final = "call"  # function of `linear_algebra.h`; detail: its name and sizes
-FAULT: Final = "fault"  # notes a fault where an entry is not zero; detail: its code
-STORE: Final = (
+NUMBERS = "numbers"  # detail: the numbers
+INPUT = "input"  # detail: name of the array of the caller
+MAP = "map"  # entry by entry; detail: C with braces for the operands
+REDUCE = "reduce"  # sums and the like over the last axes; detail: name of the ufunc
+JOIN = "join"  # operands one after the other; detail: order in which they are read, if it is another one
+PUT = "put"  # first operand, with the second one written to places; detail: these places
+COPY = "copy"  # in an array of its own
+CALL = "call"  # function of `linear_algebra.h`; detail: its name and sizes
+FAULT = "fault"  # notes a fault where an entry is not zero; detail: its code
+STORE = (
     "store"  # writes to an array of the caller; detail: its name, and the place of the first entry
 )
-WAY: Final = "way"  # what a decision on the operand does, or a loop; detail: `Way`
-BREAK: Final = "break"  # leaves the loop where the operand is zero
-MERGE: Final = "merge"  # first operand where a way was taken, else the second one
-EFFECTS: Final = frozenset({FAULT, STORE, BREAK})
+WAY = "way"  # what a decision on the operand does, or a loop; detail: `Way`
+BREAK = "break"  # leaves the loop where the operand is zero
+MERGE = "merge"  # first operand where a way was taken, else the second one
+EFFECTS = frozenset({FAULT, STORE, BREAK})
 
 
 class Operand(NamedTuple):

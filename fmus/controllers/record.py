@@ -20,7 +20,7 @@ from math import prod
 from pathlib import Path
 from threading import RLock
 from traceback import walk_tb
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -46,13 +46,13 @@ from servobench.plant.contract.checks import FloatArray
 
 Inputs: TypeAlias = Mapping[str, Any]
 Shapes: TypeAlias = Mapping[str, tuple[tuple[int, ...], str]]
-PACKAGE: Final = "servobench."
-OWN: Final = "servobench.fmus."
-HEADERS: Final = ("controller.h", "linear_algebra.h")
+PACKAGE = "servobench."
+OWN = "servobench.fmus."
+HEADERS = ("controller.h", "linear_algebra.h")
 # Numbers do not depend on the level of optimisation, and the functions are called from Python.
-CHECKED: Final = ("-O1", "-fvisibility=default")
+CHECKED = ("-O1", "-fvisibility=default")
 # The loop over systems side by side
-SIDE_BY_SIDE: Final = """#include "controller.h"
+SIDE_BY_SIDE = """#include "controller.h"
 
 #define ALL(name) \\
     void name##_all(long count, double *x, const double *u, double *y, double *codes) \\
@@ -132,7 +132,7 @@ def _real(dtype: Any) -> Any:  # noqa: ANN401 - as numpy's
     return dtype
 
 
-_MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
+_MEANINGS: tuple[tuple[Any, Any], ...] = (
     (np, _Numpy()),
     (lanes.branch, branches.branch),
     (lanes.repeat, branches.repeat),

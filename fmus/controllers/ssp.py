@@ -4,7 +4,6 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
 from servobench.fmus.compiler import Platform
 from servobench.fmus.controllers.export import COMMAND, FEATURE, POSITION, SEEN
@@ -12,9 +11,9 @@ from servobench.fmus.model_description import UNITS, exporter, xml_bytes
 from servobench.fmus.product import Product, write_archive
 from servobench.fmus.variables import BALL, INPUT
 
-SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
-SSC: Final = "http://ssp-standard.org/SSP1/SystemStructureCommon"
-STRUCTURE: Final = "SystemStructure.ssd"
+SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"
+SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+STRUCTURE = "SystemStructure.ssd"
 PLANT = "plant"
 CONTROLLER = "controller"
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import NormalDist
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -38,16 +38,16 @@ from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 
-CONFIDENCE: Final = 0.95
-ALPHA: Final = 0.05  # of each one-sided test
+CONFIDENCE = 0.95
+ALPHA = 0.05  # of each one-sided test
 # The least number of equal signs that a two-sided sign test distinguishes from chance at 5 %
-MIN_PAIRS: Final = 6
+MIN_PAIRS = 6
 # The difference in the share of lost runs up to which methods may be equivalent
-LOST_MARGIN: Final = 0.03  # [1]
+LOST_MARGIN = 0.03  # [1]
 Verdict = Literal["better", "equivalent", "worse", "undecided"]
-RESAMPLES: Final = 2000
-DRAWN_AT_ONCE: Final = 1_000_000  # values of resamples in memory; the same are drawn for any number
-MISSING: Final = "–"  # text for a number that there is not
+RESAMPLES = 2000
+DRAWN_AT_ONCE = 1_000_000  # values of resamples in memory; the same are drawn for any number
+MISSING = "–"  # text for a number that there is not
 
 
 def number(value: float, spec: str) -> str:
@@ -82,7 +82,7 @@ class Estimate:
         return Estimate(factor * self.value, low, high, self.count)
 
 
-NO_ESTIMATE: Final = Estimate(np.nan, np.nan, np.nan, 0)
+NO_ESTIMATE = Estimate(np.nan, np.nan, np.nan, 0)
 
 
 @dataclass(frozen=True)
@@ -292,20 +292,20 @@ def _sample(values: ArrayLike) -> FloatArray:
     return np.where(np.isnan(sample), np.inf, sample)
 
 
-FROM_TWIN: Final = "drawn from the twin"  # in titles, the mismatch none of such robots
-KEYS: Final = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
-CONDITION: Final = ("plant", "sensing", "task", "mismatch")  # with the settings that are varied
-HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
+FROM_TWIN = "drawn from the twin"  # in titles, the mismatch none of such robots
+KEYS = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
+CONDITION = ("plant", "sensing", "task", "mismatch")  # with the settings that are varied
+HANDY_UNITS = {"m": ("mm", 1000.0)}
 # Differences that do not matter, see `margin`
-ERROR_MARGIN: Final = 0.04  # [1] share of the settling band: 0.2 mm in 5 mm
-BOUND_MARGIN: Final = 0.1  # [1] share of the error of a controller that knows the robot
-MEDIAN_MARGIN: Final = 0.1  # [1] share of the best median, of metrics without a natural margin
-SHARE_MARGIN: Final = 0.01  # [1]
-SECOND_LAP: Final = "rms_error_second_lap"
-POINT_TO_POINT: Final = "point_to_point"
-CURVE: Final = "curve"
-SEQUENCE: Final = "sequence"
-TASK_KINDS: Final = (POINT_TO_POINT, CURVE, SEQUENCE)
+ERROR_MARGIN = 0.04  # [1] share of the settling band: 0.2 mm in 5 mm
+BOUND_MARGIN = 0.1  # [1] share of the error of a controller that knows the robot
+MEDIAN_MARGIN = 0.1  # [1] share of the best median, of metrics without a natural margin
+SHARE_MARGIN = 0.01  # [1]
+SECOND_LAP = "rms_error_second_lap"
+POINT_TO_POINT = "point_to_point"
+CURVE = "curve"
+SEQUENCE = "sequence"
+TASK_KINDS = (POINT_TO_POINT, CURVE, SEQUENCE)
 
 
 def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,8 +32,8 @@ from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
-EVERY: Final = 16  # seeds from look to look
-DECISIONS: Final = "decisions.csv"
+EVERY = 16  # seeds from look to look
+DECISIONS = "decisions.csv"
 Pair = tuple[str, str]
 
 

@@ -5,14 +5,12 @@ The unit is the robot, of which both methods have one run: whatever is drawn ane
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from servobench.harness.analysis.comparison import ALPHA, Estimate
 
-POWER: Final = 0.8  # with which a least difference is told
-MIN_AGREEMENT: Final = 0.95  # share of the splits in which both halves must order a pair alike
+POWER = 0.8  # with which a least difference is told
+MIN_AGREEMENT = 0.95  # share of the splits in which both halves must order a pair alike
 
 
 def least_difference(mean: Estimate, margin: float) -> float:

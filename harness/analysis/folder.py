@@ -1,7 +1,7 @@
 """Describes a results folder in words: its runs, how they were made, controllers with their aids, settings."""
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 
@@ -18,8 +18,8 @@ from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.settings import listed
 
 # Columns, with settings that are varied
-DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")
-TUNED: Final = "†"  # mark of a controller that a user tuned
+DESCRIBED = ("plant", "sensing", "controller", "task", "mismatch")
+TUNED = "†"  # mark of a controller that a user tuned
 
 
 def describe_folder(manifest: Manifest, runs: pd.DataFrame) -> dict[str, str]:

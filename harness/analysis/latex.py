@@ -3,7 +3,7 @@
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -18,7 +18,7 @@ from servobench.harness.config.installation import short_commit
 from servobench.harness.run.outcome import FOLLOWED, SETTLED
 from servobench.harness.run.variations import varied_columns
 
-SIGNS: Final = str.maketrans(
+SIGNS = str.maketrans(
     {
         **{sign: f"\\{sign}" for sign in "_%&#${}"},
         "\\": r"\textbackslash{}",
@@ -37,12 +37,12 @@ SIGNS: Final = str.maketrans(
         "³": "$^3$",
     }
 )
-INTERVAL: Final = re.compile(r" (\[[^\[]*\])$")
-NUMBER: Final = re.compile(r"[-+<\d∞–]")
-MINUS: Final = re.compile(r"(?<![\w.])-(?=\d)")
-MAX_LETTERS_OF_ONE_COLUMN: Final = 50  # a table with wider rows spans both columns of a paper
-HEADING: Final = 12  # letters on one line of a heading
-BIBTEX: Final = r"""\begin{filecontents*}[overwrite]{servobench.bib}
+INTERVAL = re.compile(r" (\[[^\[]*\])$")
+NUMBER = re.compile(r"[-+<\d∞–]")
+MINUS = re.compile(r"(?<![\w.])-(?=\d)")
+MAX_LETTERS_OF_ONE_COLUMN = 50  # a table with wider rows spans both columns of a paper
+HEADING = 12  # letters on one line of a heading
+BIBTEX = r"""\begin{filecontents*}[overwrite]{servobench.bib}
 @misc{servobench,
   author = {{The servobench maintainers}},
   title = {{servobench: a bench for uncalibrated visual-servoing controllers}},

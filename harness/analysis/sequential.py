@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,13 +21,11 @@ from numpy.typing import ArrayLike
 from servobench.harness.analysis.comparison import LOST_MARGIN, Verdict
 from servobench.plant.contract.checks import FloatArray
 
-CLIP: Final = 5.0  # [margins] at which a paired difference is clipped, so that it is bounded
+CLIP = 5.0  # [margins] at which a paired difference is clipped, so that it is bounded
 # Shares λ as parts of their largest value, and the weights of their wealths: it does most where methods are alike
-PARTS: Final = (0.98, 0.5, 0.25, 0.125)
-WEIGHTS: Final = (0.5, 0.25, 0.125, 0.125)
-BETS: Final = (
-    4  # for less, for more, for fewer and for more lost runs, among which the level is divided
-)
+PARTS = (0.98, 0.5, 0.25, 0.125)
+WEIGHTS = (0.5, 0.25, 0.125, 0.125)
+BETS = 4  # for less, for more, for fewer and for more lost runs, among which the level is divided
 
 
 @dataclass(frozen=True)

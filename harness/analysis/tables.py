@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from typing import Any, Final, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import pandas as pd
@@ -77,9 +77,9 @@ from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 Row: TypeAlias = "dict[str, Cell]"
-BAND: Final = ("settling_band", "feature_unit")
+BAND = ("settling_band", "feature_unit")
 # Columns that `sweep_tables` and `outcome_legend` read
-SWEEP_COLUMNS: Final = (
+SWEEP_COLUMNS = (
     "plant",
     "mismatch",
     *(short.column for short in SHORT_NAMES.values()),
@@ -94,11 +94,11 @@ SWEEP_COLUMNS: Final = (
     *BAND,
 )
 # Headings of columns of paired differences
-PAIR: Final = "A − B"
-DIFFERENCE: Final = "mean difference"
-P_VALUE: Final = "p (Holm)"
-STEP_TIME: Final = "controller_time_median_us"
-LATE: Final = "*"  # mark of a controller of which a step took longer than the period
+PAIR = "A − B"
+DIFFERENCE = "mean difference"
+P_VALUE = "p (Holm)"
+STEP_TIME = "controller_time_median_us"
+LATE = "*"  # mark of a controller of which a step took longer than the period
 
 
 @dataclass(frozen=True)
@@ -478,22 +478,22 @@ def _is_late(runs: pd.DataFrame) -> bool:
     return bool((column_of(runs, "controller_time_overruns") > 0.0).any())
 
 
-WHICH: Final = ""  # the group of columns that say which runs a row is about
-CONDITIONS: Final = ("plant", "robot", "sensing", "mismatch")  # with the settings that are varied
+WHICH = ""  # the group of columns that say which runs a row is about
+CONDITIONS = ("plant", "robot", "sensing", "mismatch")  # with the settings that are varied
 # Table -> groups of columns in order; a metric says in which of them it is
-GROUPS: Final = {
+GROUPS = {
     "moves": ("Time", "Error", "Motion", GROUP),
     "curves": ("RMS error", "Motion", GROUP),
     "cost": ("Step of the controller", "Joints", "Estimate"),
     "runs": ("Time", "Error", "Motion", GROUP),
 }
-MEANINGS: Final = {
+MEANINGS = {
     NOT_SETTLED: "the true error did not come into the settling band, or left it again",
     NOT_FOLLOWED: "the RMS error of the judged part of the curve is too large",
     TARGET_UNREACHABLE: "the true arm cannot come that near to the target or to the judged part of the curve",
     JOINT_AT_LIMIT: "a joint stood at its stop for a second while the error was too large",
 }
-MOST_PLACES: Final = 5  # that have columns of their own in the overview
+MOST_PLACES = 5  # that have columns of their own in the overview
 
 PageRow = dict[tuple[str, str], Any]
 

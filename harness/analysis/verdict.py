@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,9 +39,9 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED
 from servobench.harness.run.result import COMPLETED
 
-NAMED: Final = 3  # controllers or places that a short list names at most
-MANY: Final = 6  # those that a long list names at most
-MOST_PLACES: Final = 24  # places for which leaders are named
+NAMED = 3  # controllers or places that a short list names at most
+MANY = 6  # those that a long list names at most
+MOST_PLACES = 24  # places for which leaders are named
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from io import BytesIO
 from itertools import groupby, islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -59,14 +59,10 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.settings import REMARKS, remark
 from servobench.plant.fmu.release import delayed_releases
 
-BLOCK: Final = (
-    256  # [runs] that advance together: networks of more of them leave the cache of a processor
-)
-RUN_ID: Final = "run_id"
-TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
-CHUNK: Final = (
-    8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
-)
+BLOCK = 256  # [runs] that advance together: networks of more of them leave the cache of a processor
+RUN_ID = "run_id"
+TASKS_PER_WORKER = 2  # handed out at a time, so that no worker waits for its next task
+CHUNK = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
 
 
 @dataclass(frozen=True)
@@ -508,14 +504,14 @@ def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
     return array
 
 
-MAX_DEFAULT_WORKERS: Final = 8
-ABSENCE_TIME: Final = 120.0  # [s] without any worker, after which none is awaited any more
-LOOK_EVERY: Final = 2.0  # [s] between two looks at the workers
-SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
+MAX_DEFAULT_WORKERS = 8
+ABSENCE_TIME = 120.0  # [s] without any worker, after which none is awaited any more
+LOOK_EVERY = 2.0  # [s] between two looks at the workers
+SCHEDULER_TIMEOUT = 10.0  # [s], until a scheduler and its first worker answer
 # Imported once
-MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks", "numpy.ma")
+MODULES = ("servobench.harness.run.episode", "servobench.harness.batch.blocks", "numpy.ma")
 # Held by the one task that a process of an executor carries out at a time
-ONE_TASK: Final = threading.Lock()
+ONE_TASK = threading.Lock()
 
 
 @contextlib.contextmanager

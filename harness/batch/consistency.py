@@ -7,7 +7,6 @@ has a row that fits it, and is not noticed.
 
 import math
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -27,19 +26,19 @@ from servobench.harness.run.variations import Row
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import COMMAND, PlantSpec
 
-FROM_STEPS: Final = (  # metrics that need neither limits of the plant nor times of the task
+FROM_STEPS = (  # metrics that need neither limits of the plant nor times of the task
     "settling_time_s", "settling_time_5pct_s", "overshoot", "steady_state_error", "rms_error", "max_error", "log_error",
     "path_length_ratio", "max_joint_position_rad", "control_effort_rad", "joint_acceleration_peak_rad_s2",
     "joint_acceleration_rms_rad_s2", "joint_jerk_peak_rad_s3", "joint_jerk_rms_rad_s3", "feature_invalid_fraction",
     "controller_time_median_us", "controller_time_p99_us", "plant_time_median_us",
 )  # fmt: skip
-MOVE: Final = "point_to_point"
-SEQUENCE: Final = "sequence"
-MOVE_OUTCOMES: Final = frozenset(OUTCOMES) - {FOLLOWED, NOT_FOLLOWED}
-CURVE_OUTCOMES: Final = frozenset(OUTCOMES) - {SETTLED, NOT_SETTLED}
-ERRORS: Final = ("rms_error", "rms_error_evaluated", "rms_error_second_lap", "steady_state_error")
-TOLERANCE: Final = 1e-9  # [1] by which two sums of the same terms may differ
-ANY: Final = 1e9  # [rad, rad/s] a limit that no metric above reads
+MOVE = "point_to_point"
+SEQUENCE = "sequence"
+MOVE_OUTCOMES = frozenset(OUTCOMES) - {FOLLOWED, NOT_FOLLOWED}
+CURVE_OUTCOMES = frozenset(OUTCOMES) - {SETTLED, NOT_SETTLED}
+ERRORS = ("rms_error", "rms_error_evaluated", "rms_error_second_lap", "steady_state_error")
+TOLERANCE = 1e-9  # [1] by which two sums of the same terms may differ
+ANY = 1e9  # [rad, rad/s] a limit that no metric above reads
 
 
 def find_contradiction(row: Row, steps: pd.DataFrame | None, period: float) -> str:

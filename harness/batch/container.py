@@ -9,11 +9,10 @@ import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
 
-ROOT: Final = Path("/")
+ROOT = Path("/")
 # The last is that of version 1
-MEMORY_LIMITS: Final = ("memory.max", "memory.high", "memory.limit_in_bytes")
+MEMORY_LIMITS = ("memory.max", "memory.high", "memory.limit_in_bytes")
 
 
 def memory_limit(root: Path = ROOT) -> float:

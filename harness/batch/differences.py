@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from typing import Final
 
 from servobench.harness.batch.manifest import OWN
 from servobench.harness.batch.results import Manifest, ResultsFolder
@@ -11,16 +10,16 @@ from servobench.harness.config.settings import flatten
 from servobench.plant.contract.faults import ConfigurationError
 
 # Entries of a manifest that identify its runs
-NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")
-SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
+NAMES = ("plants", "controllers", "tasks", "mismatches", "seeds")
+SOURCES = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
 # Entries that may change the figures of later runs, and what they are called.
-VERSIONS: Final = {
+VERSIONS = {
     "git_commit": "commit",
     "packages": "packages",
     "engines": "engines",
     "blas": "BLAS",
 }
-SHOWN: Final = 60  # letters of a value that a message holds
+SHOWN = 60  # letters of a value that a message holds
 
 
 def check_same_batch(

@@ -4,7 +4,6 @@ import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
 
 from servobench.harness.batch import tables
 from servobench.harness.batch.lock import PARTS, refuse_links
@@ -26,8 +25,8 @@ from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_v
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL
 
-AGAIN: Final = "repeat the command that made the folder with --resume"
-REMADE: Final = (
+AGAIN = "repeat the command that made the folder with --resume"
+REMADE = (
     "servobench report makes the page anew; the rest comes with the runs, "
     "from the same command in a new folder"
 )

@@ -31,19 +31,19 @@ from multiprocessing import current_process, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits, show_size
 from servobench.harness.run.result import CRASHED, INSTANT, LOST, OUT_OF_MEMORY, TIMED_OUT, Ending
 from servobench.plant.contract.faults import ConfigurationError
 
-LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
-START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
-GUARD_START: Final = (
+LOOK_EVERY = 0.25  # [s] between two checks of time, memory and processes
+START_TIME = 60.0  # [s] at least until a runner has loaded the code of a task
+GUARD_START = (
     1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
 )
-GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
+GRACE = 30.0  # [s] beyond the time limit, after which a silent guard is ended
 
 
 class WorkersNotStarted(ConfigurationError, SystemExit):
@@ -55,18 +55,16 @@ class WorkersNotStarted(ConfigurationError, SystemExit):
         self.code = str(self)
 
 
-START_ERROR: Final = 1  # exit code of a guard that an error has kept from starting
-STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
-TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
-MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
-MAX_ANSWER: Final = 2**30  # [bytes] length of one answer: a larger one is damaged
-MESSAGE_PAUSE: Final = (
-    10  # [s] without a further byte, after which a message of a runner is given up
-)
-SILENT: Final = "the process of the run reported it as done without its answer"
-TALKATIVE: Final = "the process of the run gave more answers than it had runs"
-KEPT_SHARE: Final = 0.5  # share of the memory limit that a runner may hold between two tasks
-GUARD: Final = "servobench guard"  # name of its process
+START_ERROR = 1  # exit code of a guard that an error has kept from starting
+STOP_TIME = 4.0  # [s] for a guard to end the processes below it
+TRACE_TIME = 0.3  # [s] for the trace of a run that hangs
+MAX_PROCESSES = 256  # below a guard: more belong to a run that copies itself
+MAX_ANSWER = 2**30  # [bytes] length of one answer: a larger one is damaged
+MESSAGE_PAUSE = 10  # [s] without a further byte, after which a message of a runner is given up
+SILENT = "the process of the run reported it as done without its answer"
+TALKATIVE = "the process of the run gave more answers than it had runs"
+KEPT_SHARE = 0.5  # share of the memory limit that a runner may hold between two tasks
+GUARD = "servobench guard"  # name of its process
 ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
 
 # Passes an answer of JSON values up; None is only a sign of life

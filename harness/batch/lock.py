@@ -17,18 +17,16 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Self
+from typing import Self
 
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, harmless
 
 LOCK = ".lock"
-PARTS: Final = "parts"
-NAME_TIMEOUT: Final = (
-    1.0  # [s] for which a refused process waits until the holder has written its name
-)
-NAME_POLL: Final = 0.01  # [s]
+PARTS = "parts"
+NAME_TIMEOUT = 1.0  # [s] for which a refused process waits until the holder has written its name
+NAME_POLL = 0.01  # [s]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,19 +20,17 @@ from servobench.plant.contract.files import TIME, numbers_of, read_table
 from servobench.plant.contract.settings import remark, suggest
 from servobench.plant.robot.mismatch import Mismatch
 
-TABLES: Final = (".csv", ".parquet")  # suffixes
-MAX_PERIOD: Final = 2.0  # [s] between rows of a log
-USUAL_PERIODS: Final = (9e-4, 0.9)  # [s] likewise
-FIT_MARGIN: Final = (
-    1.5  # [1] times the tolerance, as the fitted steps of a short log are off themselves
-)
-PER_SECOND: Final = {"ms": 1e3, "µs": 1e6, "ns": 1e9}  # counts of a clock
-TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
-PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
+TABLES = (".csv", ".parquet")  # suffixes
+MAX_PERIOD = 2.0  # [s] between rows of a log
+USUAL_PERIODS = (9e-4, 0.9)  # [s] likewise
+FIT_MARGIN = 1.5  # [1] times the tolerance, as the fitted steps of a short log are off themselves
+PER_SECOND = {"ms": 1e3, "µs": 1e6, "ns": 1e9}  # counts of a clock
+TIME_TOLERANCE = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
+PLANT = "kinematic"  # for sizes and units of a log whose plant is not known
 # In names of plants, controllers and set-ups
-CODE: Final = re.compile(rf"^({'|'.join(FILES)})|\.(?i:py)(:|$)")
-TASK: Final = "circle"  # likewise, without effect
-RENAMED: Final = {  # counts of control periods up to 0.2.0 -> times
+CODE = re.compile(rf"^({'|'.join(FILES)})|\.(?i:py)(:|$)")
+TASK = "circle"  # likewise, without effect
+RENAMED = {  # counts of control periods up to 0.2.0 -> times
     f"initial.{word}_periods": f"initial.{word}_time" for word in ("probe", "settle", "average")
 }
 

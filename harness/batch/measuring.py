@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 from servobench.harness.batch import trials
 from servobench.harness.batch.results import ResultsFolder
@@ -11,8 +11,8 @@ from servobench.harness.run.own_metrics import METRIC_REGISTRY, values_of
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 
-LIMIT: Final = 60.0  # [s] for the metric of a run
-CODE: Final = ("sha256", "function")  # entries of a record by which code is the same
+LIMIT = 60.0  # [s] for the metric of a run
+CODE = ("sha256", "function")  # entries of a record by which code is the same
 
 
 def add_metric(folder: ResultsFolder, place: str) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from textwrap import shorten
-from typing import Any, Final, Generic, Self, TypeVar, overload
+from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
 
@@ -31,10 +31,10 @@ from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
-DEFAULT_MISMATCH: Final = "moderate"  # On plants with robots of their own it stands for none.
-MAX_SEEDS: Final = 1_000_000  # seeds of a batch
-MAX_SEED: Final = 2**63 - 1  # which the tables hold
-MAX_SHOWN: Final = 200  # [characters] length of a given text in a message
+DEFAULT_MISMATCH = "moderate"  # On plants with robots of their own it stands for none.
+MAX_SEEDS = 1_000_000  # seeds of a batch
+MAX_SEED = 2**63 - 1  # which the tables hold
+MAX_SHOWN = 200  # [characters] length of a given text in a message
 
 
 @dataclass(frozen=True)

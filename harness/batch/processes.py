@@ -22,26 +22,26 @@ from importlib import import_module
 from multiprocessing import parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, NoReturn
 
 import psutil
 
 from servobench.harness.batch.container import memory_limit, processor_limit
 
-LINUX: Final = sys.platform == "linux"  # other systems: macOS is provided for
+LINUX = sys.platform == "linux"  # other systems: macOS is provided for
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # options of prctl(2)
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
-KEPT_MEMORY: Final = 2**30  # [bytes] freed memory that a worker keeps
+KEPT_MEMORY = 2**30  # [bytes] freed memory that a worker keeps
 # [bytes] from which on a block has pages of its own; glibc takes no larger threshold
-LARGEST_BLOCK: Final = 2**25
-FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
-FOREIGN_SHARE: Final = 0.8  # share of the memory for all concurrent runs of foreign code
+LARGEST_BLOCK = 2**25
+FOREIGN_TIME = 600.0  # [s] time limit of a run of foreign code where none is given
+FOREIGN_SHARE = 0.8  # share of the memory for all concurrent runs of foreign code
 # [bytes] for each of them at least, on a machine that is no container
-LEAST_FOREIGN_MEMORY: Final = 2 * 10**9
+LEAST_FOREIGN_MEMORY = 2 * 10**9
 # [s] until all processes below this one have ended, and between two checks
 END_TIME, END_PAUSE = (5.0, 0.01)
-STAND_PAUSE: Final = 0.05  # [s] between two looks at a child that may be stopped
-OWN_TIME: Final = 1.0  # [s] for a child to end by itself once the parent has ended
+STAND_PAUSE = 0.05  # [s] between two looks at a child that may be stopped
+OWN_TIME = 1.0  # [s] for a child to end by itself once the parent has ended
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, TypeAlias, final
+from typing import Any, TypeAlias, final
 
 import pandas as pd
 import pyarrow.compute as pc
@@ -36,12 +36,10 @@ PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 FAILURES = "failures.log"
-STOPPED: Final = (
+STOPPED = (
     "runs ended when they were decided: intervals and p-values are for a fixed number of seeds"
 )
-PART: Final = re.compile(
-    rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})"
-)
+PART = re.compile(rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})")
 
 
 def part_name(index: int, kind: str) -> str:

@@ -2,19 +2,19 @@
 
 import json
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 from servobench.harness.batch.tables import DamagedFile
 from servobench.harness.config.description import plain
 from servobench.plant.contract.faults import ConfigurationError
 
 Manifest: TypeAlias = dict[str, Any]  # its entries by name
-MANIFEST: Final = "manifest.json"
-SCHEMA_VERSION: Final = "4"
+MANIFEST = "manifest.json"
+SCHEMA_VERSION = "4"
 # Since an earlier schema
-CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s [s]"}
+CHANGES = {"3": "; the column latency_periods [periods] is now latency_s [s]"}
 # Types of entries, and of their elements -> the keys of such entries
-ENTRIES: Final[dict[tuple[type, ...], tuple[str, ...]]] = {
+ENTRIES: dict[tuple[type, ...], tuple[str, ...]] = {
     (str,): ("created", "python", "platform", "campaign", "seeds"),
     (int,): ("run_count",),
     (dict,): ("changed", "packages", "engines", "until_decided"),
@@ -24,8 +24,8 @@ ENTRIES: Final[dict[tuple[type, ...], tuple[str, ...]]] = {
     (dict, list): ("side_by_side",),
     (dict, dict): ("configuration", "own_controllers", "own_plants", "own_tasks", "own_metrics", "plugins", "tuned"),
 }  # fmt: skip
-WORDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
-SHOWN: Final = 60  # letters of a wrong value that a message holds
+WORDS = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
+SHOWN = 60  # letters of a wrong value that a message holds
 
 
 class OtherSchema(ConfigurationError):

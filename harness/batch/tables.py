@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy.typing as npt
 import pandas as pd
@@ -22,15 +22,13 @@ from servobench.harness.run.variations import SHORT_NAMES, Row
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 
-ROW_GROUP: Final = (
-    2048  # [rows] of a table that are in memory at a time while parts are put together
-)
+ROW_GROUP = 2048  # [rows] of a table that are in memory at a time while parts are put together
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
 # of a table of any size, and for each byte of its file
 MAX_CELLS, MAX_CELLS_A_BYTE = (2 * 10**7, 100)
-MAX_TIME: Final = 1e9  # [s] time of a step, which other formats count in nanoseconds
-NO_THREAD: Final = "launch worker thread"  # in a message of Arrow
-BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
+MAX_TIME = 1e9  # [s] time of a step, which other formats count in nanoseconds
+NO_THREAD = "launch worker thread"  # in a message of Arrow
+BATCH = b"servobench.batch"  # key of the batch whose rows a table holds
 
 
 class DamagedFile(ConfigurationError):
@@ -254,27 +252,27 @@ def reading(folder: Path, name: str) -> Iterator[None]:
         raise DamagedFile(folder, name, f"cannot be read ({why[:160].rstrip('.')})") from error
 
 
-NEEDED: Final = {
+NEEDED = {
     "runs": ("run_id", "plant", "controller", "task", "mismatch", "seed", "status"),
     "steps": ("run_id", "time_s", "error_norm"),
 }
-TEXTS: Final = frozenset(
+TEXTS = frozenset(
     ("run_id", "plant", "controller", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit",
      "status", "outcome", "reason", "mismatch_values", "part")
 )  # fmt: skip
-WHOLE: Final = frozenset(("seed", "periods"))
-NUMBERS: Final = frozenset(
+WHOLE = frozenset(("seed", "periods"))
+NUMBERS = frozenset(
     {"settling_band", *WHOLE, *BUILT_IN, *(short.column for short in SHORT_NAMES.values())}
 )
 # And 0 is the least
-MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}
-OWN_STEMS: Final = frozenset(  # names of files and folders that a results folder, or its export, has itself
+MOST = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}
+OWN_STEMS = frozenset(  # names of files and folders that a results folder, or its export, has itself
     ("runs", "steps", "manifest", "failures", "sha256sums", "parts", "pictures", "networks", "figures", "recordings",
      "report", "latest")
 )  # fmt: skip
-MAX_NUMBER: Final = 1e150  # whose square is finite
+MAX_NUMBER = 1e150  # whose square is finite
 # Also the name of a file: no separator, no ".."
-RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")
+RUN_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")
 
 
 def lacking(kind: str, schema: pa.Schema) -> str:

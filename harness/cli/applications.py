@@ -6,13 +6,13 @@ name and imports no other. A further application is a folder of `harness/apps` w
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import typer
 
 from servobench.harness.cli.options import command
 
-HARNESS: Final = "servobench.harness"
+HARNESS = "servobench.harness"
 
 
 class Application(NamedTuple):
@@ -28,7 +28,7 @@ class Application(NamedTuple):
     """packages beside it that nothing else imports"""
 
 
-APPLICATIONS: Final = {
+APPLICATIONS = {
     "twin": Application("arm, camera and drive identified from a log", ("shadow", "identify")),
     "serve": Application("a plant on the ports of a UR, or as a robot of ROS 2", ("serve",)),
     "check": Application("a plug-in begun, and held against its contract", ("new", "check")),
@@ -47,12 +47,12 @@ APPLICATIONS: Final = {
     "loops": Application("loops at rest: margins and limits", ("analyse",)),
     "play": Application("a page on which runs are steered while they go on", ("play",), "play"),
 }
-CORE: Final = {  # module of harness/cli -> its commands
+CORE = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),
     "results": ("statistics", "collect", "verify"),
     "lists": ("plants", "controllers", "tasks", "sensing", "init"),
 }
-PANELS: Final = {  # title on the help page -> commands, in the order of first use
+PANELS = {  # title on the help page -> commands, in the order of first use
     "First steps": ("run", "compare", "statistics", "report", "figures", "record", "play"),
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from typing import Annotated, Any, Final, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.main
@@ -22,16 +22,16 @@ from servobench.plant.contract.files import harmless
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE,
         errno.ENAMETOOLONG)  # fmt: skip
-NO_THREAD: Final = "can't start new thread"  # message of Python
-HELP_NAMES: Final = ["-h", "--help"]
+NO_THREAD = "can't start new thread"  # message of Python
+HELP_NAMES = ["-h", "--help"]
 # And the reverse
-PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))
-COMPLETION_REQUEST: Final = (
+PLURALS = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))
+COMPLETION_REQUEST = (
     "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
 )
-BASH: Final = "complete_bash"
+BASH = "complete_bash"
 # At which bash splits a word, though names of methods and settings have them
-WORD_BREAKS: Final = frozenset(":=")
+WORD_BREAKS = frozenset(":=")
 
 
 def _print_version(wanted: bool) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
 
-ABSENT: Final[
-    dict[tuple[Any, Any], str]
+ABSENT: dict[
+    tuple[Any, Any], str
 ] = {}  # command and option -> why it does not have this option of others
 
 
@@ -90,7 +90,7 @@ def switch(name: str, words: str, **further: Any) -> Any:  # noqa: ANN401 - as a
     return named_option(name, "", words, **further)
 
 
-EXECUTION: Final = "Execution"  # panel of workers, limits and resuming
+EXECUTION = "Execution"  # panel of workers, limits and resuming
 option = partial(named_option, "")  # called as its parameter
 execution_option = partial(option, rich_help_panel=EXECUTION)
 execution_switch = partial(switch, rich_help_panel=EXECUTION)
@@ -143,7 +143,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-DEFAULT_MISMATCH: Final = "moderate"
+DEFAULT_MISMATCH = "moderate"
 AXES = "none, factory, lab, moderate, severe, or axes, such as links=10%+tool=20mm"
 LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
 ROBOT_WORDS = (

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from rich import progress
 from rich.console import Console
@@ -18,7 +18,7 @@ from servobench.harness.cli.terminal import end_interrupted
 from servobench.harness.run.variations import Row
 from servobench.plant.contract.files import harmless
 
-MANY_RUNS: Final = 10_000  # from which on their number and time are told first
+MANY_RUNS = 10_000  # from which on their number and time are told first
 # [s] to the first line, and from line to line at least; [1] of the time so far
 FIRST_LINE, LINE_SHARE = (5.0, 0.1)
 

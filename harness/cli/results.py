@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from servobench.harness.batch.results import Manifest, ResultsFolder
 
-MAX_SATURATED: Final = 0.8  # share of the periods
-MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
+MAX_SATURATED = 0.8  # share of the periods
+MAX_FAULTS = 10  # runs that failed, each on a line of its own
 
 
 def statistics(

@@ -18,7 +18,7 @@ from functools import partial
 from inspect import Parameter
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Generic, Protocol, TypeVar, get_type_hints
+from typing import Any, Generic, Protocol, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -47,7 +47,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings, suggest
 from servobench.plant.contract.signals import PlantSpec
 
-NAME: Final = re.compile(r"\w+(?:[:-]\w+)*")
+NAME = re.compile(r"\w+(?:[:-]\w+)*")
 
 
 @settings
@@ -286,12 +286,12 @@ def _checked_plant(entry: PlantEntry, place: str) -> PlantEntry:
     return replace(entry, build=_guarded(code, Plant), engine=engine, config_for=config_for)
 
 
-CONTROLLER: Final = Kind(
+CONTROLLER = Kind(
     "controller", ControllerEntry, (Controller,),
     "wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
     _controller_of_class, _checked_controller, _controller_of_object,
 )  # fmt: skip
-PLANT: Final = Kind(
+PLANT = Kind(
     "plant", PlantEntry, (Plant, World),
     "wanted a subclass of servobench.Plant or servobench.World, or a servobench.PlantEntry",
     _plant_of_class, _checked_plant,

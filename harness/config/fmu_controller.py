@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final, final
+from typing import Annotated, Any, final
 
 import numpy as np
 from annotated_types import MinLen
@@ -48,7 +48,7 @@ from servobench.plant.fmu.mapping import (
 )
 from servobench.plant.fmu.world import read_sized, setters
 
-CONVENTION: Final[Mapping[str, str]] = {
+CONVENTION: Mapping[str, str] = {
     "outputs": "joint_velocity_command",
     "jacobian": "jacobian",
     "joints": "joint_position",
@@ -56,7 +56,7 @@ CONVENTION: Final[Mapping[str, str]] = {
     "seen": "seen",
     "reference": "reference",
 }
-INPUTS: Final = ("joints", "features", "seen", "reference")  # roles in the order of their values
+INPUTS = ("joints", "features", "seen", "reference")  # roles in the order of their values
 
 
 @settings

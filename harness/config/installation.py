@@ -7,11 +7,11 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from servobench.plant.contract.faults import ConfigurationError
 
-EXTRAS: Final = {  # top-level module -> extra
+EXTRAS = {  # top-level module -> extra
     "pybullet": "bullet",
     "mujoco": "mujoco",
     "jinja2": "report",
@@ -25,7 +25,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "yourdfpy": "urdf",
     "viser": "play",
 }
-NO_WHEELS: Final = (3, 12)  # first version of Python for which PyBullet 3.2 offers none
+NO_WHEELS = (3, 12)  # first version of Python for which PyBullet 3.2 offers none
 
 
 def has_no_wheel() -> bool:
@@ -74,23 +74,21 @@ def _line(module: str, user: str) -> str:
 
 CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
 COMMIT_DIGITS = 12  # that a reader is shown
-DIRTY: Final = "-dirty"  # mark of a commit where code differs from it
+DIRTY = "-dirty"  # mark of a commit where code differs from it
 # File beside the code of a built distribution that holds the commit; .ci/commit_hook.py writes it
-COMMIT_FILE: Final = "commit.txt"
+COMMIT_FILE = "commit.txt"
 # Folder of the checkout, if this code lies in one
-CHECKOUT: Final = Path(__file__).resolve().parents[2]
-GIT_TIME: Final = 10.0  # [s] for an answer of git
-OTHER_CHECKOUT: Final = (
-    frozenset(  # variables by which a hook of git names a checkout, maybe another one
-        (
-            "GIT_DIR",
-            "GIT_WORK_TREE",
-            "GIT_INDEX_FILE",
-            "GIT_COMMON_DIR",
-            "GIT_OBJECT_DIRECTORY",
-            "GIT_NAMESPACE",
-            "GIT_PREFIX",
-        )
+CHECKOUT = Path(__file__).resolve().parents[2]
+GIT_TIME = 10.0  # [s] for an answer of git
+OTHER_CHECKOUT = frozenset(  # variables by which a hook of git names a checkout, maybe another one
+    (
+        "GIT_DIR",
+        "GIT_WORK_TREE",
+        "GIT_INDEX_FILE",
+        "GIT_COMMON_DIR",
+        "GIT_OBJECT_DIRECTORY",
+        "GIT_NAMESPACE",
+        "GIT_PREFIX",
     )
 )
 

@@ -14,7 +14,7 @@ from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Final, Generic, TypeAlias
+from typing import Any, Generic, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, compose, suggest_pair
@@ -44,21 +44,21 @@ PLANTS = {
 RENDERED = ("bullet", "mujoco")  # a run without a named plant is on the first one that is installed
 UNRENDERED = "kinematic"  # its plant where none of them is
 MAPPED = "fmu:"
-POLICY: Final = "onnx:"
-FILES: Final = (MAPPED, POLICY)  # with which names begin that are those of files
+POLICY = "onnx:"
+FILES = (MAPPED, POLICY)  # with which names begin that are those of files
 ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {
     "nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY",
     "revealed": "servobench.controllers.revealed:ENTRY",
 }
-CONTROLLERS: Final[Mapping[str, ControllerEntry | str]] = {**METHODS, **NOT_COMPOSED}
-MAPPINGS: Final = {".fmu": MAPPED, ".toml": MAPPED}  # an FMU, or a mapping of its names
+CONTROLLERS: Mapping[str, ControllerEntry | str] = {**METHODS, **NOT_COMPOSED}
+MAPPINGS = {".fmu": MAPPED, ".toml": MAPPED}  # an FMU, or a mapping of its names
 
 Offer: TypeAlias = Own[Any]
 _OFFERED: dict[str, Offer] = {}
-DECLARED: Final[
-    dict[str, Any]
+DECLARED: dict[
+    str, Any
 ] = {}  # metrics of users by name, as `servobench.harness.run.metrics` declares its own
 
 
@@ -203,7 +203,7 @@ class Registry(Generic[Entry]):
 
 
 # Entry points of all groups: to find them takes a file of each installed distribution.
-_published: Final = cache(entry_points)
+_published = cache(entry_points)
 
 
 @cache
@@ -273,8 +273,8 @@ def _made_controller(name: str) -> ControllerEntry | None:
         return compose(law, estimator)
 
 
-PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, files=MAPPINGS)
-CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
+PLANT_REGISTRY = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, files=MAPPINGS)
+CONTROLLER_REGISTRY = Registry[ControllerEntry](
     CONTROLLER,
     "servobench.controllers",
     CONTROLLERS,
@@ -282,7 +282,7 @@ CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
     suggest_pair,
     {**MAPPINGS, ".onnx": POLICY},
 )
-REGISTRIES: Final[Mapping[str, Registry[Any]]] = {
+REGISTRIES: Mapping[str, Registry[Any]] = {
     "plant": PLANT_REGISTRY,
     "controller": CONTROLLER_REGISTRY,
 }

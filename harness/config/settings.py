@@ -19,7 +19,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.source import show
@@ -29,10 +29,10 @@ from servobench.plant.contract.settings import override, remark
 
 Section: TypeAlias = Mapping[str, Any]  # settings by nested or dotted keys
 Config = TypeVar("Config")
-TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
-TUNING_WORDS: Final = f"{TUNING.start}:{TUNING.stop}"
+TUNING = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
+TUNING_WORDS = f"{TUNING.start}:{TUNING.stop}"
 # Assignment to a plant called as its file
-MAPPED: Final = re.compile(r"\s*(fmu:.+?\.(?i:toml))\.(.+)", re.DOTALL)
+MAPPED = re.compile(r"\s*(fmu:.+?\.(?i:toml))\.(.+)", re.DOTALL)
 
 
 class Assignment(NamedTuple):

@@ -17,7 +17,7 @@ from functools import cache, cached_property
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Final, Self, TypeAlias
+from typing import Self, TypeAlias
 
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.faults import ConfigurationError
@@ -26,12 +26,12 @@ from servobench.plant.contract.settings import suggest
 
 Name: TypeAlias = tuple[str, ...]  # name of a module, by its parts
 
-PLACE: Final = re.compile(
+PLACE = re.compile(
     r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.(?i:py))(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
 )
 PACKAGE = "servobench"
-PACKAGE_FOLDER: Final = Path(__file__).parents[2]
-_MODULES_OF_USERS: Final[set[str]] = set()  # top-level modules that users named
+PACKAGE_FOLDER = Path(__file__).parents[2]
+_MODULES_OF_USERS: set[str] = set()  # top-level modules that users named
 
 
 @dataclass(frozen=True)

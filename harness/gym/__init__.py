@@ -5,11 +5,11 @@ this module also hands the name to processes that it starts by multiprocessing, 
 """
 
 from multiprocessing import current_process
-from typing import Final, final
+from typing import final
 
 import gymnasium
 
-ENVIRONMENT: Final = "servobench/Servo-v0"
+ENVIRONMENT = "servobench/Servo-v0"
 
 
 def register() -> None:

@@ -37,8 +37,8 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch
 
 Floats32: TypeAlias = npt.NDArray[np.float32]
-FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors are clipped
-LATENESS_BOUND: Final = 2.0  # [s] beyond which the lateness of a frame is clipped
+FEATURE_BOUND = 10.0  # natural sizes, beyond which features and errors are clipped
+LATENESS_BOUND = 2.0  # [s] beyond which the lateness of a frame is clipped
 
 
 @final
@@ -130,11 +130,9 @@ class Spaces:
         return norm(desired - truth.feature) / self.spec.feature.scale
 
 
-SEEDS: Final = 2**31  # that an environment draws from where it is given none
-PLACEHOLDER: Final = (
-    "constant"  # the harness builds every run with a controller; this one costs least
-)
-MARK: Final = (40, 40, 40)  # red, green, blue
+SEEDS = 2**31  # that an environment draws from where it is given none
+PLACEHOLDER = "constant"  # the harness builds every run with a controller; this one costs least
+MARK = (40, 40, 40)  # red, green, blue
 
 
 def check_options(options: object) -> None:

@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast, final
+from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 
@@ -33,12 +33,12 @@ from servobench.plant.contract.faults import ControllerDiverged, FilterDiverged
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Observation, trusted_observation
 
-CPU_INFO: Final = Path("/proc/cpuinfo")
+CPU_INFO = Path("/proc/cpuinfo")
 # Wide vectors, where the processor has them. No operation is fused or reordered, so that the bits are the same.
-WIDE: Final = "avx2"
-FLAGS: Final = ("-fvisibility=default",)
-NOT_FINITE: Final = ControllerDiverged, "the estimate or the command is not finite"
-CAUSES: Final = {NOT_DEFINITE: (FilterDiverged, "a covariance is not positive definite")}
+WIDE = "avx2"
+FLAGS = ("-fvisibility=default",)
+NOT_FINITE = ControllerDiverged, "the estimate or the command is not finite"
+CAUSES = {NOT_DEFINITE: (FilterDiverged, "a covariance is not positive definite")}
 """Kinds of faults and words for the codes of faults, other than those of `NOT_FINITE`."""
 
 

@@ -7,7 +7,7 @@ controllers and plants that this package composes itself are not checked, so tha
 
 from collections.abc import Callable, Mapping
 from numbers import Real
-from typing import Any, Final, final
+from typing import Any, final
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from servobench.plant.contract.signals import (
     trusted_observation,
 )
 
-PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
+PLAIN = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
 MAX_NAMES = 256  # names of diagnostics in a run, each of which is a column
 MAX_LETTERS = 100  # letters of such a name
 

@@ -6,7 +6,6 @@ run is refused only where no true robot of that mismatch could do it.
 
 import math
 from functools import lru_cache
-from typing import Final
 
 import numpy as np
 
@@ -26,12 +25,10 @@ from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.robot import Robot
 
-REACH_MARGIN: Final = (
-    0.1  # [m] by which a target may be out of the nominal reach under any mismatch
-)
-MAX_PLACE: Final = 20.0  # [m] farthest target that is not remarked on
+REACH_MARGIN = 0.1  # [m] by which a target may be out of the nominal reach under any mismatch
+MAX_PLACE = 20.0  # [m] farthest target that is not remarked on
 # Usual norms of a Jacobian by unit of the feature, in this unit per rad.
-RATES: Final = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}
+RATES = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}
 
 
 def check_possible(run: ResolvedRun, drawn: Drawn, spec: PlantSpec) -> None:

@@ -9,7 +9,7 @@ import math
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -300,7 +300,7 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
     return np.array(summaries).reshape(values.shape[:-1])
 
 
-_ALL: Final = (
+_ALL = (
     Metric(
         "settling_time_s", "s", "settling time", 2,
         "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row "
@@ -470,7 +470,7 @@ _ALL: Final = (
         tables={"moves": "Error"},
     ),
 )  # fmt: skip
-BUILT_IN: Final = {metric.column: metric for metric in _ALL}
+BUILT_IN = {metric.column: metric for metric in _ALL}
 """Every metric of this package by the name of its column, in the order of the table of runs."""
-METRICS: Final[Mapping[str, Metric]] = ChainMap(DECLARED, BUILT_IN)
+METRICS: Mapping[str, Metric] = ChainMap(DECLARED, BUILT_IN)
 """The same, and then those of users that the present command knows."""

@@ -15,7 +15,6 @@ reach drives joints to their stops, not the other way round. The band of a curve
 """
 
 import math
-from typing import Final
 
 import numpy as np
 
@@ -33,13 +32,13 @@ from servobench.plant.robot.inverse import closest_distance
 SETTLED, NOT_SETTLED = "settled", "not_settled"
 FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"
 TARGET_UNREACHABLE, JOINT_AT_LIMIT = "target_unreachable", "joint_at_limit"
-ACHIEVED: Final = (SETTLED, FOLLOWED)
+ACHIEVED = (SETTLED, FOLLOWED)
 # The outcomes of runs that complete.
-OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)
-FOLLOWING_BANDS: Final = 2.0  # settling bands: an RMS error of 10 mm on the UR5
-AT_STOP: Final = 1e-6  # [rad] from a joint's stop
-HELD: Final = 1.0  # [s] at a stop
-CURVE_POINTS: Final = 32  # points of the judged part of a curve that must be in reach
+OUTCOMES = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)
+FOLLOWING_BANDS = 2.0  # settling bands: an RMS error of 10 mm on the UR5
+AT_STOP = 1e-6  # [rad] from a joint's stop
+HELD = 1.0  # [s] at a stop
+CURVE_POINTS = 32  # points of the judged part of a curve that must be in reach
 
 
 def find_outcome(

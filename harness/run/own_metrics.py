@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeAlias
 
 from servobench.harness.config.entries import Kind
 from servobench.harness.config.registry import DECLARED, Registry
@@ -27,8 +27,8 @@ from servobench.plant.contract.settings import NonNegative, settings
 if TYPE_CHECKING:
     import pandas as pd
 
-GROUP: Final = "Own"  # columns in tables of the report, and kind of figure
-TABLES: Final = ("moves", "curves", "runs")  # tables of the report
+GROUP = "Own"  # columns in tables of the report, and kind of figure
+TABLES = ("moves", "curves", "runs")  # tables of the report
 
 
 Digits: TypeAlias = Literal[0, 1, 2, 3, 4, 5, 6]
@@ -170,10 +170,8 @@ def _refuse_class(given: type[Any]) -> NoReturn:
     raise ConfigurationError(f"{given.__name__} is a class; a metric is a function")
 
 
-_WANTED: Final = 'wanted a function below @servobench.metric(unit="...")'
-_KIND: Final = Kind[OwnMetric](
-    "metric", OwnMetric, (), _WANTED, _refuse_class, lambda entry, _: entry
-)
-METRIC_REGISTRY: Final = Registry[OwnMetric](
+_WANTED = 'wanted a function below @servobench.metric(unit="...")'
+_KIND = Kind[OwnMetric]("metric", OwnMetric, (), _WANTED, _refuse_class, lambda entry, _: entry)
+METRIC_REGISTRY = Registry[OwnMetric](
     _KIND, "servobench.metrics", {}, advice=lambda _: "name a function, such as ./mine.py:itae"
 )

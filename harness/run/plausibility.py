@@ -3,8 +3,6 @@
 Settings that are valid one by one and make no run together are refused, such as a time longer than the run.
 """
 
-from typing import Final
-
 from servobench.harness.run.request import RunSettings
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -13,7 +11,7 @@ from servobench.plant.contract.settings import likely_meant, remark
 from servobench.plant.robot.hand_eye import RobotModel
 
 # Noise, steps and outliers are remarked on beyond this share of an image, or of a metre.
-MAX_EXTENT: Final = 0.1  # [1]
+MAX_EXTENT = 0.1  # [1]
 
 
 def check_times(run: RunSettings, plant: str, config: object, duration: float) -> None:

@@ -14,7 +14,7 @@ hand about the target at home; ρ is at most 1, and smaller by as much as less o
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeAlias, final
+from typing import Literal, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
-MAX_BEGIN: Final = 1e6  # [s] after which the first waypoint is one of a clock that counts from 1970 or from a start-up
+MAX_BEGIN = 1e6  # [s] after which the first waypoint is one of a clock that counts from 1970 or from a start-up
 TaskKind: TypeAlias = Literal["point_to_point", "curve", "sequence"]
 """Whether a task's reference is a fixed target, moves, or jumps from one target to the next."""
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 from annotated_types import Ge
 
@@ -36,7 +36,7 @@ from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, WITH, short_name
 from servobench.plant.robot.mismatch import Mismatch
 
-OWN_ROBOT: Final = "own"  # in the column `robot`: the plant brings it
+OWN_ROBOT = "own"  # in the column `robot`: the plant brings it
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
 NAMES = ("plant", "controller", "task", "robot", "sensing")  # fields of a request that are texts
 

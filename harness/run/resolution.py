@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,7 @@ from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.twin import Twin
 
-_BUT_SEED: Final = attrgetter(
-    "plant", "controller", "task", "mismatch", "varied", "robot", "sensing"
-)
+_BUT_SEED = attrgetter("plant", "controller", "task", "mismatch", "varied", "robot", "sensing")
 
 
 class Sections(dict[str, Any]):

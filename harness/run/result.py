@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servobench.harness.config.source import PACKAGE_FOLDER, is_users
 from servobench.harness.run.variations import Row
@@ -32,13 +32,13 @@ NUMERICAL_ERROR = "numerical_error"
 CRASHED = "crashed"
 TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
 OUT_OF_MEMORY = "out_of_memory"
-NETWORKS: Final = "networks"  # folder of trained networks, of the cache and of results
-LOST: Final = "the run killed the process that carried it out"
+NETWORKS = "networks"  # folder of trained networks, of the cache and of results
+LOST = "the run killed the process that carried it out"
 
 # [s] The last control instant of the run that this process carries out, shared with the process above; -inf before it.
-INSTANT: Final = ctypes.c_double.from_buffer(mmap.mmap(-1, 8))
+INSTANT = ctypes.c_double.from_buffer(mmap.mmap(-1, 8))
 
-TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
+TRACE_FRAMES = 12  # the deepest ones of a trace, which shows no more
 HARNESS = str(PACKAGE_FOLDER / "harness")
 
 

@@ -1,7 +1,7 @@
 """The sampling of a run: the true robot, its cameras and the task on it, drawn from a mismatch and a seed."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.mismatch import MismatchSample, sample_mismatch
 
-POINTS: Final = 12  # points of a curve that are checked
+POINTS = 12  # points of a curve that are checked
 
 
 @dataclass(frozen=True, eq=False)

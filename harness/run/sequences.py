@@ -7,7 +7,7 @@ the true arm that are drawn as those of the task `random`, whose move with the s
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge
@@ -27,14 +27,14 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import Count, Duration, settings
 
-CORNER_INTERVAL: Final = 3  # targets, the last of which is a corner of the box
-CORNERS_AT_ONCE: Final = 64
-MAX_DRAWS: Final = 100  # draws of the next target, or of a curve
-LAP_POINTS: Final = 16  # points of a curve that must be fit
+CORNER_INTERVAL = 3  # targets, the last of which is a corner of the box
+CORNERS_AT_ONCE = 64
+MAX_DRAWS = 100  # draws of the next target, or of a curve
+LAP_POINTS = 16  # points of a curve that must be fit
 # Shares of the way from home to a corner, or to the ends of a move, that are tried one after the other
-SHARES: Final = tuple(np.linspace(1.0, 0.1, MAX_DRAWS).tolist())
-CURVE_SHARE: Final = 0.5  # factor on these shares, for a curve
-FIRST_LATER: Final = 2  # number of moves before those that are judged
+SHARES = tuple(np.linspace(1.0, 0.1, MAX_DRAWS).tolist())
+CURVE_SHARE = 0.5  # factor on these shares, for a curve
+FIRST_LATER = 2  # number of moves before those that are judged
 
 
 @settings

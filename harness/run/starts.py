@@ -26,7 +26,7 @@ The start is found on the nominal arm. Where an arm cannot reach it with the tar
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Final, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from annotated_types import Gt, Le
@@ -45,19 +45,19 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.robot.workspace import Workspace
 
-PLACES: Final = "start_and_target"  # name of the generator from which they are drawn
-MAX_PAIRS: Final = 1000  # pairs of start and target; one in two fits
-PAIRS_AT_ONCE: Final = 4
-DRAWN_AT_ONCE: Final = 256
-MAX_DRAWS: Final = 25_600
+PLACES = "start_and_target"  # name of the generator from which they are drawn
+MAX_PAIRS = 1000  # pairs of start and target; one in two fits
+PAIRS_AT_ONCE = 4
+DRAWN_AT_ONCE = 256
+MAX_DRAWS = 25_600
 # Shares of the images' half sides within which the planned and the true cameras see the features.
-PLANNED_SHARE: Final = 0.8
-TRUE_SHARE: Final = 0.95
-FACING: Final = 0.7  # cosine of the angle between the target's front and the camera: 45°
-REACHED: Final = 1e-6  # largest error of `reach_pose` for a pose that is reached
-SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)  # shares of D that are tried
-STEPS: Final = 8  # in which the arm is led from home to the start
-IN_VIEW: Final = 0.9  # share of the image's half sides within which the target is at the start
+PLANNED_SHARE = 0.8
+TRUE_SHARE = 0.95
+FACING = 0.7  # cosine of the angle between the target's front and the camera: 45°
+REACHED = 1e-6  # largest error of `reach_pose` for a pose that is reached
+SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)  # shares of D that are tried
+STEPS = 8  # in which the arm is led from home to the start
+IN_VIEW = 0.9  # share of the image's half sides within which the target is at the start
 
 
 class Box(NamedTuple):

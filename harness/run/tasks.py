@@ -10,7 +10,7 @@ group `servobench.tasks`.
 """
 
 from dataclasses import is_dataclass, replace
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from servobench.harness.config.entries import Kind, check_settings, summary_of
 from servobench.harness.config.registry import Registry
@@ -35,9 +35,9 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED
 from servobench.plant.robot.workspace import Workspace
 
-LONG_RUN: Final = 600.0  # [s]
-RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] radii of the curves on a UR5
-STRETCHED_START: Final = "singular_start"
+LONG_RUN = 600.0  # [s]
+RADII = {"circle": 0.3, "lemniscate": 0.25}  # [m] radii of the curves on a UR5
+STRETCHED_START = "singular_start"
 
 
 @settings
@@ -214,7 +214,7 @@ class WaypointTask(Task):
 
 EXP1, EXP2, EXP3, EXP4 = (PointTask(start=start, target=target) for start, target in MOVES.values())
 # 1.5 m straight on from the ball's start
-UNREACHABLE: Final = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)
+UNREACHABLE = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)
 
 _ENTRIES = (
     TaskEntry("exp1", "a move whose target lies outside the training region", EXP1),
@@ -279,9 +279,9 @@ def _checked(entry: TaskEntry, place: str) -> TaskEntry:
     return entry
 
 
-_WANTED: Final = "wanted a dataclass below servobench.Task or a servobench.TaskEntry"
-_KIND: Final = Kind("task", TaskEntry, (Task,), _WANTED, _of_class, _checked)
-TASK_REGISTRY: Final = Registry(_KIND, "servobench.tasks", TASKS)
+_WANTED = "wanted a dataclass below servobench.Task or a servobench.TaskEntry"
+_KIND = Kind("task", TaskEntry, (Task,), _WANTED, _of_class, _checked)
+TASK_REGISTRY = Registry(_KIND, "servobench.tasks", TASKS)
 find_task, choose_task, task_names = TASK_REGISTRY.find, TASK_REGISTRY.choose, TASK_REGISTRY.names
 
 

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 
 class ShortName(NamedTuple):
@@ -17,15 +17,15 @@ class ShortName(NamedTuple):
     unit: str = "ms"  # unit of this number
 
 
-SHORT_NAMES: Final[Mapping[str, ShortName]] = {
+SHORT_NAMES: Mapping[str, ShortName] = {
     "noise": ShortName("plant.sensing.noise_factor", "noise_factor", "noise factor", 1.0, 1.0, ""),
     "latency": ShortName("plant.sensing.latency", "latency_s", "latency [ms]"),
     "period": ShortName("run.period", "period_s", "period [ms]"),
 }
-ROLES: Final = ("plant", "controller", "task")
+ROLES = ("plant", "controller", "task")
 # The beginnings of the key of a varied setting.
-SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))
-ORDER: Final = {short.key: order for order, short in enumerate(SHORT_NAMES.values())}
+SECTIONS = ("run.", *(f"{role}." for role in ROLES))
+ORDER = {short.key: order for order, short in enumerate(SHORT_NAMES.values())}
 
 Row: TypeAlias = Mapping[str, Any]  # of the table of runs, by its columns
 Value: TypeAlias = float | int | bool | str | tuple["Value", ...]

@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import Any, Final, NamedTuple, Self, final
+from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 import numpy.typing as npt
@@ -42,8 +42,8 @@ from servobench.plant.contract.signals import (
 )
 from servobench.plant.robot.mechanics import RippledJacobian
 
-MAX_STEP: Final = 1e-3  # [s] longest sub-step to which times are rounded
-NEGLIGIBLE: Final = 1e-6  # [s] by which a time may be rounded without a remark
+MAX_STEP = 1e-3  # [s] longest sub-step to which times are rounded
+NEGLIGIBLE = 1e-6  # [s] by which a time may be rounded without a remark
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +38,7 @@ from servobench.plant.contract.sensing import (
 )
 from servobench.plant.contract.signals import BoolArray
 
-TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
+TIME_TOLERANCE = 1e-9  # [s] within which two times are equal
 
 
 class Sensor:

@@ -24,7 +24,6 @@ functions take leading axes.
 """
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -34,13 +33,13 @@ from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
 # A nearer point is not valid, and its features are those of this least depth.
-NEAR: Final = 0.02  # [m]
-NEWTON_STEPS: Final = 12  # Convergence is quadratic from a start within the image.
-BISECTIONS: Final = 60  # They lead from r = 1000 down to rounding.
+NEAR = 0.02  # [m]
+NEWTON_STEPS = 12  # Convergence is quadratic from a start within the image.
+BISECTIONS = 60  # They lead from r = 1000 down to rounding.
 # It is added to r², so that a fisheye has a derivative on the optical axis.
-AXIS_OFFSET: Final = 1e-24  # [1]
+AXIS_OFFSET = 1e-24  # [1]
 # Columns of `Optics.further` by the model of the lens, under its name in ROS.
-COLUMNS: Final = {"plumb_bob": 6, "equidistant": 7, "rational_polynomial": 9}
+COLUMNS = {"plumb_bob": 6, "equidistant": 7, "rational_polynomial": 9}
 
 
 @dataclass(frozen=True, eq=False)

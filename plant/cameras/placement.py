@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from math import atan2, cos, radians, sin
-from typing import Final
 
 import numpy as np
 
@@ -37,10 +36,10 @@ from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import camera_pose
 
-SIDE: Final = radians(60.0)  # angle of the second fixed camera's optical axis from the vertical
-HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
-MAX_BALL_SHARE: Final = 0.6  # [1] usual largest share of the image's height that a ball takes
-BASELINE: Final = 0.2  # [m] between two cameras on the hand; for a UR5
+SIDE = radians(60.0)  # angle of the second fixed camera's optical axis from the vertical
+HAND_DISTANCE = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
+MAX_BALL_SHARE = 0.6  # [1] usual largest share of the image's height that a ball takes
+BASELINE = 0.2  # [m] between two cameras on the hand; for a UR5
 OPTICAL = ("focal", "centre", "distortion")  # axes of a mismatch that a camera in pixels has
 ON_HAND = "mount"  # the axis that a camera on the hand has
 

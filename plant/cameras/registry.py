@@ -18,10 +18,10 @@ from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample
 from servobench.plant.robot.robot import Robot
 
-SETUPS: Final = {setup.name: setup for setup in (POSITION, PIXEL, STEREO, PLATE)}
+SETUPS = {setup.name: setup for setup in (POSITION, PIXEL, STEREO, PLATE)}
 FIXED: Final = "fixed"
 HAND: Final = "hand"
-DEFAULT_SENSING: Final = "position"
+DEFAULT_SENSING = "position"
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Final, Literal, Self, TypeAlias, final
+from typing import Literal, Self, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -44,13 +44,13 @@ Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 """Points (..., c, p, 3) [m] in the frame of each camera, and the optics -> features (..., m)."""
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
-FINE_STEP: Final = 1e-6  # [1] share of the motions over which features are differentiated
+FINE_STEP = 1e-6  # [1] share of the motions over which features are differentiated
 # The same for a `measure` in single precision, and where `rates` are checked
-COARSE_STEP: Final = 1e-3  # [1]
-FLOAT_TYPES: Final = (np.float64, np.float32)  # types that `measure` and `rates` may return
-CHECK_POSES: Final = 5  # poses of the target at which the functions of a user's set-up are checked
+COARSE_STEP = 1e-3  # [1]
+FLOAT_TYPES = (np.float64, np.float32)  # types that `measure` and `rates` may return
+CHECK_POSES = 5  # poses of the target at which the functions of a user's set-up are checked
 # Share of the fastest rate by which `rates` may differ from the derivative
-RATE_TOLERANCE: Final = 1e-3  # [1]
+RATE_TOLERANCE = 1e-3  # [1]
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, 
 """Make a set-up of points in images, the features of which are `pixels`."""
 
 # Half side of the plate's square, at the corners of which the discs are
-HALF_SIDE: Final = 0.12  # [m]
+HALF_SIDE = 0.12  # [m]
 
 POSITION = SensingSetup(
     "position",
@@ -297,7 +297,7 @@ PLATE = in_pixels(
 
 Mount: TypeAlias = Literal["fixed", "hand"]
 """Whether the cameras are beside the arm and the target on it, or the reverse."""
-MIN_INCIDENCE: Final = 0.2  # cosine of the angle beyond which discs on a plate are not valid
+MIN_INCIDENCE = 0.2  # cosine of the angle beyond which discs on a plate are not valid
 
 
 @final

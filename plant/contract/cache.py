@@ -21,33 +21,30 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from platformdirs import user_cache_path
 
 from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, read_sums
 from servobench.plant.contract.settings import remark
 
-FILES: Final = "files"
-UNFINISHED: Final = ".unfinished-"
-EXTRACTED: Final = "extracted"  # kind of unpacked FMUs
-BUILT: Final = "fmus"  # kind of FMUs that were built here
-COMPILED: Final = "compiled"  # kind of controllers in C that were compiled here
-CODE: Final = (EXTRACTED, BUILT, COMPILED)  # kinds whose files are loaded as code
-PRIVATE: Final = 0o700  # mode of a folder that is for its owner only
+FILES = "files"
+UNFINISHED = ".unfinished-"
+EXTRACTED = "extracted"  # kind of unpacked FMUs
+BUILT = "fmus"  # kind of FMUs that were built here
+COMPILED = "compiled"  # kind of controllers in C that were compiled here
+CODE = (EXTRACTED, BUILT, COMPILED)  # kinds whose files are loaded as code
+PRIVATE = 0o700  # mode of a folder that is for its owner only
 # Errors of a folder that this user may not write
-NOT_ALLOWED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
 # A path that reads the same in a URI, which an FMU gets
-PLAIN: Final = re.compile(r"[\w.~/-]*", re.ASCII)
-LOCK_TIME: Final = 10.0  # [s] for another process to move its entry
-LOCK_PAUSE: Final = 0.01  # [s] between two tries
+PLAIN = re.compile(r"[\w.~/-]*", re.ASCII)
+LOCK_TIME = 10.0  # [s] for another process to move its entry
+LOCK_PAUSE = 0.01  # [s] between two tries
 # Also for a pipe, and the file of another user
-LOCK_FLAGS: Final = os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK
-MAX_ENTRIES: Final = (
-    32  # number of entries of a kind that are kept if they are older than `MIN_AGE`
-)
-MIN_AGE: Final = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
-MAX_AGE: Final = 90 * 24 * 3600.0  # [s] since its last use, above which an entry is removed
+LOCK_FLAGS = os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK
+MAX_ENTRIES = 32  # number of entries of a kind that are kept if they are older than `MIN_AGE`
+MIN_AGE = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
+MAX_AGE = 90 * 24 * 3600.0  # [s] since its last use, above which an entry is removed
 
 _unfinished = partial(tempfile.TemporaryDirectory, prefix=UNFINISHED, ignore_cleanup_errors=True)
 _verified: set[Path] = set()

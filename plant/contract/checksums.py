@@ -11,14 +11,13 @@ import re
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
 
 from servobench.plant.contract.files import partial_path, sync, write_atomically
 
-SUMS: Final = "SHA256SUMS"
+SUMS = "SHA256SUMS"
 # Within the folder
-LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>(?!/|(.*/)?\.\.?(/|$))\S[^\0]*)")
-TABLE_END: Final = b"PAR1"  # the last bytes of a Parquet file
+LINE = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>(?!/|(.*/)?\.\.?(/|$))\S[^\0]*)")
+TABLE_END = b"PAR1"  # the last bytes of a Parquet file
 
 # The digests that a file may have, by its name within the folder
 Sums = Mapping[str, frozenset[str]]

@@ -2,12 +2,12 @@
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import with_tuples
 
-DATA: Final = Path(str(files("servobench.plant") / "data"))
+DATA = Path(str(files("servobench.plant") / "data"))
 
 
 def read_facts(name: str) -> Any:  # noqa: ANN401 - as the file has them

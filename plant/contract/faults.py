@@ -17,11 +17,9 @@ A plant or controller of a third party derives its own from `RunFault`.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import ClassVar, Final
+from typing import ClassVar
 
-MAX_LENGTH: Final = (
-    4000  # characters of a message; a longer one repeats something that a file holds
-)
+MAX_LENGTH = 4000  # characters of a message; a longer one repeats something that a file holds
 
 
 class RunFault(RuntimeError):

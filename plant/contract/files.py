@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
@@ -18,33 +18,27 @@ if TYPE_CHECKING:
     from servobench.plant.contract.checks import FloatArray
 
 # The begin of a formula that a spreadsheet runs: in a cell, or behind a mark that some countries put between cells.
-FORMULA: Final = re.compile(
+FORMULA = re.compile(
     "^(?=[=+\\-@\t\uff1d\uff0b\uff0d\uff20])|(?<=[;\t])(?=[=+\\-@\uff1d\uff0b\uff0d\uff20])"
 )
-CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-TOML_TEXT: Final = re.compile(  # a text of any of four kinds, or a comment
+CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+TOML_TEXT = re.compile(  # a text of any of four kinds, or a comment
     r'''"""(?:[^"\\]++|\\.|""?+(?!"))*+"{3,5}|\'{3}.*?\'{3,5}|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*'|#[^\n]*''',
     re.DOTALL,
 )
-MAX_KEY_PARTS: Final = 32
-TOML_LONG_KEY: Final = re.compile(
-    rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}"""
-)
-MAX_TOML: Final = 500_000  # [letters] beside texts and comments
-MAX_KEY: Final = 10_000  # [letters]
+MAX_KEY_PARTS = 32
+TOML_LONG_KEY = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}""")
+MAX_TOML = 500_000  # [letters] beside texts and comments
+MAX_KEY = 10_000  # [letters]
 # Marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
-AROUND_FILE: Final = re.compile("[=:]")
-MAX_MARKS: Final = 16  # that a path in a list may have
-TIME: Final = "time_s"  # column of a table
-TIME_KINDS: Final = ("m", "M")  # numpy's kinds of durations and dates
-SECONDS: Final = (
-    f"for a column {TIME} in s, take (times - times[0]).total_seconds(), of a column by .dt"
-)
-MAX_NUMBER: Final = (
-    1e30  # beyond which no quantity is, and squares of errors are near the largest number
-)
+AROUND_FILE = re.compile("[=:]")
+MAX_MARKS = 16  # that a path in a list may have
+TIME = "time_s"  # column of a table
+TIME_KINDS = ("m", "M")  # numpy's kinds of durations and dates
+SECONDS = f"for a column {TIME} in s, take (times - times[0]).total_seconds(), of a column by .dt"
+MAX_NUMBER = 1e30  # beyond which no quantity is, and squares of errors are near the largest number
 # Name of a file that is being written, or whose process was killed
-PARTIAL: Final = re.compile(r"\..+-\d+-\d+")
+PARTIAL = re.compile(r"\..+-\d+-\d+")
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:

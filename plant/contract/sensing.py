@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -152,12 +152,12 @@ def without_disturbance(sensing: SensingConfig) -> SensingConfig:
     return SensingConfig(0.0, sensing.latency, frame_period=sensing.frame_period)
 
 
-LENGTH: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-EXTENTS: Final = {**LENGTH, "px": math.nan}
-SHARE: Final = {"%": 1e-2, "": 1.0}
-NUMBER: Final = {"": 1.0}
-TIME: Final = {"ms": 1e-3, "s": 1.0}
-ANGLE: Final = {"deg": math.pi / 180.0, "rad": 1.0}
+LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+EXTENTS = {**LENGTH, "px": math.nan}
+SHARE = {"%": 1e-2, "": 1.0}
+NUMBER = {"": 1.0}
+TIME = {"ms": 1e-3, "s": 1.0}
+ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
 
 
 class SensorAxis(NamedTuple):
@@ -170,7 +170,7 @@ class SensorAxis(NamedTuple):
     family: Family | None = None  # the family of noise that it chooses; None for none
 
 
-SENSOR_AXES: Final = {
+SENSOR_AXES = {
     "mixture": SensorAxis(SHARE, "10%", "noise_share", "mixture"),
     "bimodal": SensorAxis(SHARE, "10%", "noise_share", "bimodal"),
     "stable": SensorAxis(NUMBER, "1.5", "stability", "stable"),
@@ -215,7 +215,7 @@ Shape: TypeAlias = tuple[int, ...]
 Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 
 # Floor of differences that rounding could make 0 or negative: half the grid of the generator's numbers.
-TINY: Final = 2.0**-54
+TINY = 2.0**-54
 
 
 def mixture(

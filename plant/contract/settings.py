@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import (
     Annotated,
     Any,
-    Final,
     Self,
     TypeAlias,
     TypeVar,
@@ -162,7 +161,7 @@ File: TypeAlias = Annotated[
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
-REMARKS: Final = list[str]()  # remarks that this worker process keeps for its parent
+REMARKS = list[str]()  # remarks that this worker process keeps for its parent
 MAX_LISTED = 40  # number of names in an error message
 _BOUNDS = {
     "greater_than": ("gt", "above", operator.gt),
@@ -170,8 +169,8 @@ _BOUNDS = {
     "less_than": ("lt", "below", operator.lt),
     "less_than_equal": ("le", "at most", operator.le),
 }
-STORED_STRINGS: Final = Path(__file__).parents[1] / "data" / "field_strings.json"
-UNIT: Final = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the beginning of a string below a field
+STORED_STRINGS = Path(__file__).parents[1] / "data" / "field_strings.json"
+UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the beginning of a string below a field
 _WANTED = {
     "finite_number": "finite",
     "float_type": "a number",

@@ -5,11 +5,10 @@ A setting's own unit stands in brackets at the beginning of the string below its
 
 import math
 import re
-from typing import Final
 
-DEGREES: Final = 180.0 / math.pi
-EXTENT: Final = "m or px"  # own unit of lengths that are pixels where features are pixels
-UNITS: Final = {  # own unit -> unit -> how many of it are one of the own unit
+DEGREES = 180.0 / math.pi
+EXTENT = "m or px"  # own unit of lengths that are pixels where features are pixels
+UNITS = {  # own unit -> unit -> how many of it are one of the own unit
     "s": {"s": 1.0, "ms": 1e3, "us": 1e6, "min": 1.0 / 60.0},
     "m": {"m": 1.0, "cm": 1e2, "mm": 1e3},
     EXTENT: {"m": 1.0, "cm": 1e2, "mm": 1e3, "px": 1.0},
@@ -21,10 +20,10 @@ UNITS: Final = {  # own unit -> unit -> how many of it are one of the own unit
     "kg": {"kg": 1.0, "g": 1e3},
     "Hz": {"Hz": 1.0, "kHz": 1e-3},
 }
-RATES: Final = {"Hz": "s"}  # unit -> own unit of which it is the reciprocal
-SPELLINGS: Final = str.maketrans({"°": "deg", "µ": "u", "μ": "u"})
-NUMBER: Final = r"(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
-QUANTITY: Final = re.compile(rf"([-+]?{NUMBER})(?:\s*/\s*({NUMBER}))?\s*(.*)", re.IGNORECASE)
+RATES = {"Hz": "s"}  # unit -> own unit of which it is the reciprocal
+SPELLINGS = str.maketrans({"°": "deg", "µ": "u", "μ": "u"})
+NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
+QUANTITY = re.compile(rf"([-+]?{NUMBER})(?:\s*/\s*({NUMBER}))?\s*(.*)", re.IGNORECASE)
 
 
 def split_quantity(text: str) -> tuple[float, str] | None:

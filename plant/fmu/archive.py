@@ -10,28 +10,23 @@ import lzma
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import Final
 
 from servobench.plant.contract.cache import EXTRACTED, cached
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import accessing
 
-DESCRIPTION: Final = "modelDescription.xml"
-MAX_FILES: Final = 20_000  # number of files in an archive
-MAX_UNPACKED: Final = 2_000_000_000  # [bytes] size of all files together
-MAX_DESCRIPTION: Final = (
-    32_000_000  # [bytes] size of the model description, which is read into memory
-)
-MAX_RATIO: Final = (
-    100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
-)
-SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
-USUAL_ENCODING: Final = "cp437"  # in which Python's reader takes names without a mark
-UTF8_MARK: Final = 0x800
+DESCRIPTION = "modelDescription.xml"
+MAX_FILES = 20_000  # number of files in an archive
+MAX_UNPACKED = 2_000_000_000  # [bytes] size of all files together
+MAX_DESCRIPTION = 32_000_000  # [bytes] size of the model description, which is read into memory
+MAX_RATIO = 100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
+SMALL = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
+USUAL_ENCODING = "cp437"  # in which Python's reader takes names without a mark
+UTF8_MARK = 0x800
 # Errors of the disk, not of the archive.
-DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)
-DAMAGES: Final = (  # raised by Python's reader of archives
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)
+DAMAGES = (  # raised by Python's reader of archives
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, OSError, OverflowError,
     RuntimeError, ValueError,
 )  # fmt: skip

@@ -14,24 +14,24 @@ from math import prod
 from operator import itemgetter
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from servobench.plant.contract.settings import suggest
 from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.archive import DESCRIPTION
 from servobench.plant.fmu.dialect import DIALECTS, FmiDialect
 
-REAL_TYPES: Final = ("Real", "Float64", "Float32")
-NUMERIC: Final = (*REAL_TYPES, "Integer", "Boolean", "Int32")
-MAX_NUMBERS: Final = 1_000_000  # largest size of a variable
-BASES: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")  # whose exponents define a unit
-SI_UNITS: Final = {
+REAL_TYPES = ("Real", "Float64", "Float32")
+NUMERIC = (*REAL_TYPES, "Integer", "Boolean", "Int32")
+MAX_NUMBERS = 1_000_000  # largest size of a variable
+BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")  # whose exponents define a unit
+SI_UNITS = {
     (0, 1, 0, 0, 0, 0, 0, 0): "m",
     (0,) * 7 + (1,): "rad",
     (0, 0, -1, 0, 0, 0, 0, 1): "rad/s",
 }
 # A file name without folders; the standard wants an identifier of C.
-IDENTIFIER: Final = re.compile(r"(?!\.)[\w.+ -]{1,200}")
+IDENTIFIER = re.compile(r"(?!\.)[\w.+ -]{1,200}")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ whose arguments differ are methods of the classes in `plant.fmu.instances`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from servobench.plant.contract.facts import read_facts
 
@@ -33,8 +33,8 @@ class FmiDialect:
     early: str  # word for a step that ended early, in messages
 
 
-FMI: Final = read_facts("fmi")
-FMI2: Final = FmiDialect(**FMI["fmi2"])
-FMI3: Final = FmiDialect(**FMI["fmi3"])
-INTEGERS: Final = FMI["integers"]
-DIALECTS: Final = {dialect.version: dialect for dialect in (FMI2, FMI3)}
+FMI = read_facts("fmi")
+FMI2 = FmiDialect(**FMI["fmi2"])
+FMI3 = FmiDialect(**FMI["fmi3"])
+INTEGERS = FMI["integers"]
+DIALECTS = {dialect.version: dialect for dialect in (FMI2, FMI3)}

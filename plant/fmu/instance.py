@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar, Final, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -31,14 +31,14 @@ from servobench.plant.fmu.release import release
 Call: TypeAlias = Callable[[], None]
 RawCall: TypeAlias = Callable[[], int]  # The caller has to check the returned status.
 # Statuses of FMI.
-OK: Final = 0
-WARNING: Final = 1
-DISCARD: Final = 2
-FATAL: Final = 4
+OK = 0
+WARNING = 1
+DISCARD = 2
+FATAL = 4
 MIN_PROGRESS = 1e-9  # least share of a step for a partial step
-RELATIVE_TOLERANCE: Final = 1e-8
-MAX_SOLVER_STEPS: Final = 100_000  # steps of CVode in one step of the plant
-MAX_EVENT_ITERATIONS: Final = 1000  # iterations at one instant
+RELATIVE_TOLERANCE = 1e-8
+MAX_SOLVER_STEPS = 100_000  # steps of CVode in one step of the plant
+MAX_EVENT_ITERATIONS = 1000  # iterations at one instant
 
 
 class Port:

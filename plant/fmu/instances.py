@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription
@@ -22,9 +22,9 @@ from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Port, 
 from servobench.plant.fmu.library import MessageLog, plain_root
 
 # Codes of FMI 2: types of an FMU, and a status that can be asked for.
-MODEL_EXCHANGE: Final = 0
-CO_SIMULATION: Final = 1
-LAST_SUCCESSFUL_TIME: Final = 2
+MODEL_EXCHANGE = 0
+CO_SIMULATION = 1
+LAST_SUCCESSFUL_TIME = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,4 +319,4 @@ class Instance3(Instance):
         self.call("ExitConfigurationMode")
 
 
-INSTANCES: Final = {kind.dialect.version: kind for kind in (Instance2, Instance3)}
+INSTANCES = {kind.dialect.version: kind for kind in (Instance2, Instance3)}

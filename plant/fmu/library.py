@@ -9,14 +9,14 @@ from collections import deque
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from servobench.plant.contract.cache import EXTRACTED, UNFINISHED, cache_folder, forbids_code
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.files import accessing
 from servobench.plant.fmu.description import FmuDescription
 
-NOEXEC_REMEDY: Final = (
+NOEXEC_REMEDY = (
     "; it lies on a file system that is mounted noexec, so no code is loaded from it: let TMPDIR and XDG_CACHE_HOME "
     "name folders elsewhere"
 )
@@ -122,8 +122,8 @@ def plain_root(root: Path) -> Path:
 
 logger = logging.getLogger("servobench.fmu")
 
-STATUS_WORDS: Final = dict(enumerate(("ok", "warning", "discard", "error", "fatal", "pending")))
-STATUS_LEVELS: Final = (
+STATUS_WORDS = dict(enumerate(("ok", "warning", "discard", "error", "fatal", "pending")))
+STATUS_LEVELS = (
     logging.DEBUG,
     logging.WARNING,
     logging.WARNING,
@@ -131,7 +131,7 @@ STATUS_LEVELS: Final = (
     logging.ERROR,
     logging.DEBUG,
 )
-REMEMBERED_MESSAGES: Final = 5
+REMEMBERED_MESSAGES = 5
 
 
 class MessageLog:

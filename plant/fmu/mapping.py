@@ -13,7 +13,7 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import MISSING, field, fields, replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 from annotated_types import MinLen
@@ -45,19 +45,17 @@ from servobench.plant.fmu.library import logger
 
 Roles = TypeVar("Roles")
 # Units of FMUs that are never another spelling of the wanted one.
-DECLARED: Final = {unit for units in UNITS.values() for unit in units if unit not in {"", "%"}} | {
+DECLARED = {unit for units in UNITS.values() for unit in units if unit not in {"", "%"}} | {
     "um", "km", "mrad", "rev", "mrad/s", "rpm", "m/s", "mm/s", "rad/s2", "deg/s2", "m/s2", "N", "N.m", "A", "V",
 }  # fmt: skip
 # Outputs that may be named more than once, such as one flag
-REPEATED: Final = {"seen", "truth.jacobian", "jacobian"}
-STEP_TOLERANCE: Final = (
+REPEATED = {"seen", "truth.jacobian", "jacobian"}
+STEP_TOLERANCE = (
     1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
 )
-WHOLE_TOLERANCE: Final = 1e-9  # [s] between a period and its steps
-MIN_DIGITS: Final = 4  # A step with fewer digits is exact.
-MAX_STEP_ERROR: Final = (
-    1e-3  # relative error of a step from one instant of an FMU's clock to the next
-)
+WHOLE_TOLERANCE = 1e-9  # [s] between a period and its steps
+MIN_DIGITS = 4  # A step with fewer digits is exact.
+MAX_STEP_ERROR = 1e-3  # relative error of a step from one instant of an FMU's clock to the next
 
 
 @settings

@@ -7,10 +7,9 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Timer
-from typing import Final
 
-RELEASE_TIME: Final = 5.0  # [s] for all instances of a run, after which their process is ended
-_delayed: Final[list[list[Callable[[], None]]]] = []  # a list for each context
+RELEASE_TIME = 5.0  # [s] for all instances of a run, after which their process is ended
+_delayed: list[list[Callable[[], None]]] = []  # a list for each context
 
 
 def release(act: Callable[[], None]) -> None:

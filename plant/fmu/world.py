@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from math import prod
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,15 +52,15 @@ from servobench.plant.fmu.release import release
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
 
-REHEARSED_STEPS: Final = 5  # periods of an arm at rest in which outputs of foreign FMUs may jump
-MIN_JUMP: Final = 1e-6  # [unit of the output]
-MAX_JUMP_RATIO: Final = 5.0  # [1] A change that exceeds those after it by this factor is a jump.
+REHEARSED_STEPS = 5  # periods of an arm at rest in which outputs of foreign FMUs may jump
+MIN_JUMP = 1e-6  # [unit of the output]
+MAX_JUMP_RATIO = 5.0  # [1] A change that exceeds those after it by this factor is a jump.
 # Names in exported arms.
-ARM_JOINTS: Final = ("joint_velocity_command", "joint_position")
-ARM_FEATURES: Final = ("ball_position", "feature")
+ARM_JOINTS = ("joint_velocity_command", "joint_position")
+ARM_FEATURES = ("ball_position", "feature")
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
-STRUCTURAL: Final = "structuralParameter"
-EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
+STRUCTURAL = "structuralParameter"
+EXACT = 2**53  # largest number up to which float64 holds all whole numbers
 
 Setter = Callable[[Instance, int], None]
 

@@ -21,7 +21,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final, Generic, NamedTuple, Self, TypeVar, final
+from typing import Any, Generic, NamedTuple, Self, TypeVar, final
 
 import cv2
 import numpy as np
@@ -62,15 +62,15 @@ from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.robot import Robot
 
-MAX_SIZE: Final = (
+MAX_SIZE = (
     1024  # [px] largest side of an ideal image: a lens with a wider view is black at its edges
 )
 # Stands for a point that is not found, whose features are not valid.
-NOWHERE: Final = (0.0, 0.0, 1.0)
-CROSS: Final = 5  # [px] half size of the cross that marks a point in a picture
+NOWHERE = (0.0, 0.0, 1.0)
+CROSS = 5  # [px] half size of the cross that marks a point in a picture
 # Names of the random streams.
-DEPTH: Final = "depth_noise"
-COLOUR: Final = "colour_noise"
+DEPTH = "depth_noise"
+COLOUR = "colour_noise"
 
 Model = TypeVar("Model", bound=RobotModel)
 

@@ -17,7 +17,7 @@ that they cover, by the intrinsics that are planned.
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, 
 from servobench.plant.robot.camera import IntArray, PinholeCamera
 
 Colour = tuple[float, float, float, float]  # red, green, blue and opacity, each up to 1
-RED: Final = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
+RED = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
 
 
 class MarkColour(NamedTuple):
@@ -37,7 +37,7 @@ class MarkColour(NamedTuple):
     hues: HueRange  # range of its pixels, if OpenCV is fed with red, green, blue; no two overlap
 
 
-MARK_COLOURS: Final = (
+MARK_COLOURS = (
     MarkColour(RED, RED_RANGE),
     MarkColour((0.90, 0.80, 0.05, 1.0), ((84, 120, 40), (102, 255, 255))),  # yellow
     MarkColour((0.05, 0.75, 0.15, 1.0), ((46, 120, 40), (65, 255, 255))),  # green

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any
 
 import cv2
 import mujoco
@@ -45,9 +45,9 @@ if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(lambda _: None)
 
 # OpenGL platforms of Linux and their libraries, in order of preference.
-LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
-ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # OpenGL platforms of other systems
-INSTALL: Final = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
+LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
+ELSEWHERE = {"darwin": "cgl", "win32": "glfw"}  # OpenGL platforms of other systems
+INSTALL = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
 # Mesh of a cylinder or sphere: MuJoCo's default of 28 slices and 16 stacks takes twice the time.
 SLICES = 24
 STACKS = 6

@@ -5,7 +5,7 @@ cross of thin rods with a white pad behind each disc, so that it hides nothing a
 """
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Self
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -19,16 +19,16 @@ from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
 
-WHITE: Final = (0.97, 0.97, 0.97, 1.0)
-DISC_RADIUS: Final = 0.02  # [m] for a UR5
-PAD_RADIUS: Final = 0.035  # [m] radius of the white pad behind a disc, for a UR5
-LAYER: Final = 0.001  # [m] thickness of discs and pads, for a UR5
-ROD_RADIUS: Final = 0.004  # [m] for a UR5
+WHITE = (0.97, 0.97, 0.97, 1.0)
+DISC_RADIUS = 0.02  # [m] for a UR5
+PAD_RADIUS = 0.035  # [m] radius of the white pad behind a disc, for a UR5
+LAYER = 0.001  # [m] thickness of discs and pads, for a UR5
+ROD_RADIUS = 0.004  # [m] for a UR5
 # [m] Radius and length of a camera on the hand, for a UR5; too near to be in its own image.
-HOUSING: Final = (0.02, 0.06)
-OVERVIEW_POSITION: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
-OVERVIEW_TARGET: Final = (0.40, 0.0, 0.26)  # [m] the point on its optical axis
-OVERVIEW_CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
+HOUSING = (0.02, 0.06)
+OVERVIEW_POSITION = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
+OVERVIEW_TARGET = (0.40, 0.0, 0.26)  # [m] the point on its optical axis
+OVERVIEW_CAMERA = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 
 
 @dataclass(frozen=True, eq=False)

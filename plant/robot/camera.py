@@ -7,7 +7,7 @@ offset the error is 2.5 mm at 1.3 m.
 """
 
 from dataclasses import replace
-from typing import Annotated, Final, Self, TypeAlias
+from typing import Annotated, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -104,7 +104,7 @@ class PinholeCamera:
         return matrix
 
 
-CAMERA: Final = PinholeCamera()  # planned camera of the bench
+CAMERA = PinholeCamera()  # planned camera of the bench
 
 
 def view_matrix(X_BC: FloatArray) -> FloatArray:

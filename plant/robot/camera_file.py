@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -39,26 +39,26 @@ from servobench.plant.robot.camera_formats import (
     read_intrinsics,
 )
 
-SYNONYMS: Final = {name: lens for lens, names in FACTS["lens_names"].items() for name in names}
-WANTED: Final = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
-RANGES: Final = {  # unit, least and largest number
+SYNONYMS = {name: lens for lens, names in FACTS["lens_names"].items() for name in names}
+WANTED = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
+RANGES = {  # unit, least and largest number
     "width": ("px", 16, 20_000), "height": ("px", 16, 20_000), "vertical_fov": ("deg", 2, 170),
     "rate": ("Hz", 0.5, 1000), "latency": ("s", 0, 5),
 }  # fmt: skip
-FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of the image
-MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
-MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
+FOCAL = (0.1, 30.0)  # least and largest focal length over the width of the image
+MAX_PLACE = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
+MAX_OFF = 0.1  # share of the image by which the principal point is usually off its middle
 # Share of its distance from the middle by which a distortion usually moves a point at most
-MAX_MOVED: Final = 0.5  # [1]
-ENDLESS: Final = 1e6  # [1] r² of a ray that no image shows
-MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] from the optical axis to it
-ROUNDED_ROOT: Final = 1e-9  # [1] by which the root of a polynomial is off at most
-MIN_AHEAD: Final = 0.5  # usual least cosine of the angle between the z axes of camera and flange
+MAX_MOVED = 0.5  # [1]
+ENDLESS = 1e6  # [1] r² of a ray that no image shows
+MAX_ANGLE = math.atan(math.sqrt(ENDLESS))  # [rad] from the optical axis to it
+ROUNDED_ROOT = 1e-9  # [1] by which the root of a polynomial is off at most
+MIN_AHEAD = 0.5  # usual least cosine of the angle between the z axes of camera and flange
 # Largest deviation of whole control periods from a frame that is in step with them
-IN_STEP: Final = 2e-4  # [1]
+IN_STEP = 2e-4  # [1]
 # Largest difference of a frame of whole milliseconds from the camera's
-MAX_ROUNDED: Final = 0.015  # [1]
-ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
+MAX_ROUNDED = 0.015  # [1]
+ROUNDED = 1e-3  # largest error of a rotation whose numbers were rounded
 Row = tuple[Number, ...]
 
 

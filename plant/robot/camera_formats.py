@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from math import isfinite
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -16,16 +16,14 @@ from servobench.plant.contract.facts import read_facts
 from servobench.plant.contract.files import read_text
 from servobench.plant.contract.settings import remark
 
-FACTS: Final = read_facts("cameras")
-NAMES: Final = FACTS["names"]
-LENSES: Final = FACTS["lenses"]
-PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
+FACTS = read_facts("cameras")
+NAMES = FACTS["names"]
+LENSES = FACTS["lenses"]
+PARTS = ("projection_parameters", "distortion_parameters")  # sections of VINS
 # Parts of names, or whole names, of keys that may hold a distortion
-DISTORTION: Final = re.compile(
-    r"dist(?!ance)|coeff|radial|tangential|^kc$|^[kp]_?\d$", re.IGNORECASE
-)
+DISTORTION = re.compile(r"dist(?!ance)|coeff|radial|tangential|^kc$|^[kp]_?\d$", re.IGNORECASE)
 # Numbers that PyYAML takes for texts
-NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]\.\d+")
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]\.\d+")
 
 
 def plain_name(text: str) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path, PurePath
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,14 +29,14 @@ from servobench.plant.robot.ur5 import UR5
 from servobench.plant.robot.urdf_elements import RUN_XACRO
 from servobench.plant.robot.workspace import search_workspace, with_ball
 
-ROBOTS: Final = {title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS} | {
+ROBOTS = {title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS} | {
     "panda": panda
 }
 """The arms by their makers' tables; each is made once."""
-DEFAULT_ROBOT: Final = UR5
-WITH: Final = " with "  # between a robot and the file of its camera
+DEFAULT_ROBOT = UR5
+WITH = " with "  # between a robot and the file of its camera
 # The suffixes of files of robots, and one that is refused
-SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf", ".xacro")
+SUFFIXES = (".yaml", ".yml", ".toml", ".urdf", ".xacro")
 
 
 @configuration_errors()
@@ -216,17 +216,17 @@ def _read_twin_robot(path: Path, values: Mapping[str, Any]) -> Robot:
     return replace(robot, name=path.stem, title=f"{robot.title} twin", source=path.name, twin=twin)
 
 
-RANDOM_ARM: Final = "random_arm"  # followed by a colon and the number
-MAX_NUMBER: Final = 1_000_000
-MIN_JOINTS: Final = 3
-MAX_JOINTS: Final = 7
-TOTAL_LENGTH: Final = 1.2  # [m] length of all links together, about that of a UR5
-MAX_SKEW: Final = math.radians(10.0)  # largest deviation of a twist from quarter turns
-LENGTH_PROBABILITY: Final = 0.6  # probability that a length or an offset is not zero
-MIN_LENGTH: Final = 0.2  # [1] least length that is not zero, over the largest one, before scaling
-JOINT_RANGE: Final = 0.9 * math.pi  # [rad] range of a joint to either side
-JOINT_SPEED: Final = math.pi  # [rad/s]
-MAX_DRAWS: Final = 200
+RANDOM_ARM = "random_arm"  # followed by a colon and the number
+MAX_NUMBER = 1_000_000
+MIN_JOINTS = 3
+MAX_JOINTS = 7
+TOTAL_LENGTH = 1.2  # [m] length of all links together, about that of a UR5
+MAX_SKEW = math.radians(10.0)  # largest deviation of a twist from quarter turns
+LENGTH_PROBABILITY = 0.6  # probability that a length or an offset is not zero
+MIN_LENGTH = 0.2  # [1] least length that is not zero, over the largest one, before scaling
+JOINT_RANGE = 0.9 * math.pi  # [rad] range of a joint to either side
+JOINT_SPEED = math.pi  # [rad/s]
+MAX_DRAWS = 200
 
 
 @cache

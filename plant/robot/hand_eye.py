@@ -10,7 +10,7 @@ The robots of many runs side by side are one model, whose arrays have leading ax
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Final, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ SERIES_ANGLE = 1e-3  # [rad] below it, sin(α/2)/α is a series
 # Largest deviation of the entries of R Rᵀ from those of the identity
 ROTATION_TOLERANCE = 1e-9  # [1]
 # Shares of the way to a posture at which features are sought
-WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)
+WAY_FROM_HOME = np.linspace(1.0, 0.0, 21)
 
 
 class RobotModel(ABC):

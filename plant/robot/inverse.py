@@ -13,8 +13,6 @@ The pose of the flange, from one start, with the geometric Jacobian J (6×n) and
     Δq = Jᵀ (J Jᵀ + λ I)⁻¹ [ℓ⁻¹ (p* − p); log(R* Rᵀ)],        q ← clip(q + Δq, lower, upper)   if the error shrinks
 """
 
-from typing import Final
-
 import numpy as np
 import numpy.typing as npt
 
@@ -22,14 +20,14 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, plus_diagonal, take
 from servobench.plant.robot.arm import SerialArm
 
-STARTS: Final = 16
-ITERATIONS: Final = 120
-CLOSE_ENOUGH: Final = 1e-6  # [m] a point counts as reached, and the search for it ends
-FIRST_DAMPING: Final = 1e-2  # [m²]
-DAMPING_BOUNDS: Final = (1e-9, 1e6)  # [m²]
+STARTS = 16
+ITERATIONS = 120
+CLOSE_ENOUGH = 1e-6  # [m] a point counts as reached, and the search for it ends
+FIRST_DAMPING = 1e-2  # [m²]
+DAMPING_BOUNDS = (1e-9, 1e6)  # [m²]
 # Factors on the damping after an accepted and after a rejected step
-SHRINK: Final = 0.3
-GROW: Final = 4.0
+SHRINK = 0.3
+GROW = 4.0
 Limits = tuple[FloatArray, FloatArray]  # lower and upper joint positions, (n,) and (n,) [rad]
 
 
@@ -149,13 +147,13 @@ def _step(
     return np.asarray(np.clip(q + step, lower, upper))
 
 
-POSE_ITERATIONS: Final = 100
+POSE_ITERATIONS = 100
 # The search ends at this norm of the error, with lengths over the arm's and angles in rad.
-POSE_TOLERANCE: Final = 1e-9  # [1]
-FIRST_POSE_DAMPING: Final = 1e-3
+POSE_TOLERANCE = 1e-9  # [1]
+FIRST_POSE_DAMPING = 1e-3
 # Factors on the damping after an accepted and after a rejected step
-POSE_SHRINK: Final = 0.2
-POSE_GROW: Final = 5.0
+POSE_SHRINK = 0.2
+POSE_GROW = 5.0
 
 
 def reach_pose(

@@ -13,7 +13,6 @@ from functools import cache
 from math import pi
 from operator import itemgetter
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,11 +25,11 @@ from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_iner
 from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
 
 Triple = tuple[float, float, float]
-CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-LENGTHS: Final = ("a2", "a3", "d1", "d4", "d5", "d6")  # names of DH lengths that are not 0
-ALIKE: Final = (2, 1, 3)  # joints of shoulder, elbow and wrist that share a number of a `Triple`
-UR_SOURCE: Final = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
-PANDA_SOURCE: Final = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
+CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+LENGTHS = ("a2", "a3", "d1", "d4", "d5", "d6")  # names of DH lengths that are not 0
+ALIKE = (2, 1, 3)  # joints of shoulder, elbow and wrist that share a number of a `Triple`
+UR_SOURCE = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
+PANDA_SOURCE = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def _arm_of_lengths(a2: float, a3: float, d1: float, d4: float, d5: float, d6: f
     return arm_from_dh(a, d, ur5.DH_ALPHA, ur5.JOINT_NAMES)
 
 
-UNIVERSAL_ROBOTS: Final = {
+UNIVERSAL_ROBOTS = {
     title: UniversalRobot(**row) for title, row in ur5.ARMS["universal_robots"].items()
 }
 
@@ -122,7 +121,7 @@ def panda() -> Robot:
 
 
 # Largest deviation of a calibrated arm from the data sheet; real ones differ by a millimetre or two.
-MAX_DEVIATION: Final = 0.02  # [m]
+MAX_DEVIATION = 0.02  # [m]
 
 
 def measured_arm(robot: Robot, file: str | None) -> SerialArm:

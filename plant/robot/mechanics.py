@@ -10,7 +10,7 @@ base frame. Gravity is left out: the ball rests at δ = 0. Play is exact where q
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Gt
@@ -22,9 +22,9 @@ from servobench.plant.contract.settings import NonNegative, Positive, ShareBelow
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
 # In each part of a period play is updated once and the acceleration of a tool changes linearly.
-MAX_PART: Final = 0.005  # [s]
+MAX_PART = 0.005  # [s]
 # The closed form of a flexible tool's motion loses its digits below these frequencies, and overflows far above.
-FREQUENCIES: Final = (0.1, 1e6)  # [rad/s]
+FREQUENCIES = (0.1, 1e6)  # [rad/s]
 Motion: TypeAlias = tuple[FloatArray, FloatArray]
 """p [m] and ṗ [m/s], (..., 3) each."""
 
@@ -148,7 +148,7 @@ class RippledJacobian:
         return J * slope
 
 
-MECHANICS_AXES: Final = {
+MECHANICS_AXES = {
     "backlash": SensorAxis(ANGLE, "2deg", "backlash"),
     "ripple": SensorAxis(ANGLE, "0.03rad", "ripple"),
     "flexible_tool": SensorAxis(NUMBER, "12", "tool_frequency"),

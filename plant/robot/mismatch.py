@@ -25,7 +25,7 @@ import re
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import radians
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 
@@ -393,14 +393,14 @@ def _profile(
     return {"links": share, **angles, "tool": tool, **cameras}
 
 
-PROFILES: Final = {
+PROFILES = {
     "none": {},
     "factory": {},
     "moderate": _profile(0.05, 3.0, 15.0, 0.02, 5.0),
     "severe": _profile(0.1, 6.0, 45.0, 0.04, 10.0),
     "lab": _profile(0.008, 0.1, 8.0, 0.01, 2.0) | {"mount": radians(8.0)},
 }
-PROFILE_SETTINGS: Final = {
+PROFILE_SETTINGS = {
     "lab": {
         "command_delay": 0.005,
         "lag": 0.03,
@@ -409,7 +409,7 @@ PROFILE_SETTINGS: Final = {
     }
 }
 """Defaults of plants that come with a profile, by dotted key [s, m]; sources of all numbers are in docs/mismatch.md."""
-USUAL_SHARE: Final = 0.3  # [1] beyond which a share without a unit is likely one of percent
+USUAL_SHARE = 0.3  # [1] beyond which a share without a unit is likely one of percent
 
 
 @dataclass(frozen=True)

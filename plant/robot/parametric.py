@@ -25,7 +25,7 @@ contiguous numbers; stacks of small matrices cost several times as much.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -37,11 +37,11 @@ from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.twin import TOOL, links_of
 
-TARGET: Final = ("target_x", "target_y", "target_z")
+TARGET = ("target_x", "target_y", "target_z")
 """[m] added to the target's place in the base frame, for cameras on the hand."""
-ALIGNMENT: Final = 0.002  # [m²] weight of the planned rotation in `placed`
+ALIGNMENT = 0.002  # [m²] weight of the planned rotation in `placed`
 Indices: TypeAlias = npt.NDArray[np.int_]
-POSE: Final = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 
 class Frame(NamedTuple):

@@ -11,7 +11,7 @@ gravity; a UR5 has 1.2 times this torque in its shoulder and more in its wrists.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 
@@ -110,15 +110,15 @@ class Robot:
         return replace(robot, workspace=workspace)
 
 
-DENSITY: Final = 1100.0  # [kg/m³] mean density of the UR5's links as cylinders
-TUBE_SHARE: Final = 0.055  # radius of the first tube over the arm's length from the shoulder on
-TAPER: Final = 0.65  # radius of the last tube over that of the first
-TORQUE_FACTOR: Final = 1.5  # torque limit over the torque that holds the stretched arm
-MIN_TORQUE: Final = 5.0  # [Nm] least torque limit that is estimated
-GRAVITY: Final = 9.81  # [m/s²]
+DENSITY = 1100.0  # [kg/m³] mean density of the UR5's links as cylinders
+TUBE_SHARE = 0.055  # radius of the first tube over the arm's length from the shoulder on
+TAPER = 0.65  # radius of the last tube over that of the first
+TORQUE_FACTOR = 1.5  # torque limit over the torque that holds the stretched arm
+MIN_TORQUE = 5.0  # [Nm] least torque limit that is estimated
+GRAVITY = 9.81  # [m/s²]
 # Centres of mass (n, 3) [m] and inertia (n, 3, 3) [kg m²] of links
 Bodies = tuple[FloatArray, FloatArray]
-PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
+PAYLOAD_SHARE = 0.27  # rated load over the arm's own mass, that of a UR5
 
 
 def cylinder_inertia(mass: FloatArray, radius: FloatArray, arm: SerialArm) -> FloatArray:

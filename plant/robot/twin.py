@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +37,12 @@ from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera_file import ROUNDED, CameraFile, frame_time
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 
-TIMES: Final = ("latency", "command_delay", "lag")
-CAMERA: Final = tuple(f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z"))
-TOOL: Final = ("tool_x", "tool_y", "tool_z")
-LENS: Final = ("focal", "centre_u", "centre_v", "distortion")
-MAX_DEVIATION: Final = 0.5  # [s, m, rad or 1] usual largest deviation of a parameter
-MIN_LENGTH: Final = 1e-6  # [m] a shorter part of a translation is no length
+TIMES = ("latency", "command_delay", "lag")
+CAMERA = tuple(f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z"))
+TOOL = ("tool_x", "tool_y", "tool_z")
+LENS = ("focal", "centre_u", "centre_v", "distortion")
+MAX_DEVIATION = 0.5  # [s, m, rad or 1] usual largest deviation of a parameter
+MIN_LENGTH = 1e-6  # [m] a shorter part of a translation is no length
 Rows = tuple[tuple[Number, ...], ...]
 
 

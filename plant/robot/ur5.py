@@ -5,7 +5,6 @@ and torques); inertia tensors by the cylinder approximation that the vendor's RO
 """
 
 from dataclasses import replace
-from typing import Final
 
 from servobench.plant.contract.facts import DATA, read_facts
 from servobench.plant.robot.arm import SerialArm, arm_from_dh
@@ -13,22 +12,22 @@ from servobench.plant.robot.arm import SerialArm, arm_from_dh
 UR5 = "ur5"  # name of the robot in the catalogue
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
-ARMS: Final = read_facts("arms")
+ARMS = read_facts("arms")
 """Facts by arm, with units and sources in the file."""
 _FACTS = ARMS["ur5"]
 DH_A = _FACTS["a"]
 DH_D = _FACTS["d"]
 DH_ALPHA = _FACTS["alpha"]
-LINKS: Final = _FACTS["links"]
+LINKS = _FACTS["links"]
 """Fields of `servobench.plant.robot.robot.Links` but for the payload."""
 MAX_TORQUE = LINKS["torque"]
 TOOL = _FACTS["tool"]
-WORKSPACE: Final = _FACTS["workspace"]
+WORKSPACE = _FACTS["workspace"]
 """Fields of `servobench.plant.robot.workspace.Workspace`."""
 MOVES = WORKSPACE["moves"]
 HOME = WORKSPACE["home"]
 STRETCHED = WORKSPACE["stretched"]
-CALIBRATION: Final = DATA / "ur5_factory_calibration.yaml"  # the file of one real UR5
+CALIBRATION = DATA / "ur5_factory_calibration.yaml"  # the file of one real UR5
 TRAINING_LOWER = WORKSPACE["lower"]
 TRAINING_UPPER = WORKSPACE["upper"]
 

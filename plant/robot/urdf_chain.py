@@ -10,7 +10,7 @@ an axis is refused.
 import re
 from collections import Counter, defaultdict
 from math import isclose
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,17 +19,17 @@ from servobench.plant.contract.settings import Check, listed, read_value, remark
 from servobench.plant.robot.files import Lengths
 from servobench.plant.robot.urdf_elements import Tree
 
-TURNING: Final = ("revolute", "continuous")
-MIN_JOINTS: Final = 3  # least number of rotating joints of an arm
+TURNING = ("revolute", "continuous")
+MIN_JOINTS = 3  # least number of rotating joints of an arm
 # Parts of names: of the links and joints of fingers, of the joints of grippers, and of joints that turn a whole gripper
-FINGER: Final = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)
-GRIPPER: Final = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)
-WRIST: Final = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)
+FINGER = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)
+GRIPPER = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)
+WRIST = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)
 # Longest travel of a sliding joint that is a finger without a name or a companion
-MAX_STROKE: Final = 0.1  # [m]
+MAX_STROKE = 0.1  # [m]
 # Largest relative difference of the distances of two fingers from their palm
-MIRRORED: Final = 0.01  # [1]
-LENGTHS: Final = Check.of(Lengths, bare=True)
+MIRRORED = 0.01  # [1]
+LENGTHS = Check.of(Lengths, bare=True)
 # A joint as yourdfpy, which is not typed, reads it
 JointElement: TypeAlias = Any
 Ways = dict[str, list[JointElement]]  # link -> joints from the root to it, as yourdfpy reads them

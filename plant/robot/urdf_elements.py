@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from io import BytesIO
 from math import hypot, isfinite
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 from xml.etree import ElementTree as ET
 
 from servobench.plant.contract.facts import read_facts
@@ -28,31 +28,29 @@ from servobench.plant.robot.arm import rpy_from_rotation
 Element: TypeAlias = Any
 Tree: TypeAlias = Any
 
-RUN_XACRO: Final = "run xacro first, and give what it prints: `xacro FILE > arm.urdf`"
-READ_QUATERNION: Final = (
-    'quat_xyzw of <origin>, which is read; ROS reads it in <robot version="1.1"> only'
-)
-URDF: Final = read_facts("urdf")
-ATTRIBUTES: Final = URDF["attributes"]
-CHILDREN: Final = URDF["children"]
-SIMILAR: Final = URDF["similar"]
-REQUIRED: Final = URDF["required"]
-OF_OTHERS: Final = URDF["of_others"]
-OF_XACRO: Final = URDF["of_xacro"]
-ENDS: Final = ("parent", "child")
+RUN_XACRO = "run xacro first, and give what it prints: `xacro FILE > arm.urdf`"
+READ_QUATERNION = 'quat_xyzw of <origin>, which is read; ROS reads it in <robot version="1.1"> only'
+URDF = read_facts("urdf")
+ATTRIBUTES = URDF["attributes"]
+CHILDREN = URDF["children"]
+SIMILAR = URDF["similar"]
+REQUIRED = URDF["required"]
+OF_OTHERS = URDF["of_others"]
+OF_XACRO = URDF["of_xacro"]
+ENDS = ("parent", "child")
 # Elements of a joint whose values are geometry
-GEOMETRY: Final = ("origin", "axis", "limit", "mimic")
-LIMITING: Final = ("limit", "safety_controller")  # elements whose numbers may be infinite
-TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-MOMENTS: Final = {"ixx", "iyy", "izz"}
-EXPRESSION: Final = re.compile(r"\$[{(].*?[})]")  # xacro would replace it
+GEOMETRY = ("origin", "axis", "limit", "mimic")
+LIMITING = ("limit", "safety_controller")  # elements whose numbers may be infinite
+TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+MOMENTS = {"ixx", "iyy", "izz"}
+EXPRESSION = re.compile(r"\$[{(].*?[})]")  # xacro would replace it
 # In names of limits without geometry
-DYNAMIC: Final = re.compile(r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff")
-NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-INFINITE: Final = re.compile(r"[-+]?inf(inity)?", re.IGNORECASE)
-ZEROS: Final = re.compile(r"[-+.0\s]*")
+DYNAMIC = re.compile(r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff")
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+INFINITE = re.compile(r"[-+]?inf(inity)?", re.IGNORECASE)
+ZEROS = re.compile(r"[-+.0\s]*")
 # Mark in a word that is no number, and remedy
-REMEDIES: Final = (
+REMEDIES = (
     (re.compile(r"[${}()*/]|pi"), RUN_XACRO),
     (re.compile(","), "numbers have a decimal point and blanks between them"),
     (
@@ -61,10 +59,10 @@ REMEDIES: Final = (
     ),
 )
 # Faults of XML that ROS tolerates as well
-TOLERATED: Final = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION", "ERR_RESERVED_XML_NAME")
-LIKENESS: Final = 0.75  # least ratio of difflib between a misspelt word and the one that is meant
-MAX_TURN: Final = 7.0  # [rad] largest usual angle of an rpy
-ROUNDED_UNIT: Final = 0.01  # largest deviation of a quaternion's norm from 1
+TOLERATED = ("NS_ERR_UNDEFINED_NAMESPACE", "ERR_UNKNOWN_VERSION", "ERR_RESERVED_XML_NAME")
+LIKENESS = 0.75  # least ratio of difflib between a misspelt word and the one that is meant
+MAX_TURN = 7.0  # [rad] largest usual angle of an rpy
+ROUNDED_UNIT = 0.01  # largest deviation of a quaternion's norm from 1
 
 
 def read_elements(path: Path) -> Tree:

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from math import inf, isfinite, pi
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -18,25 +18,25 @@ from servobench.plant.robot.urdf_chain import Chain, Joint, JointElement, find_c
 from servobench.plant.robot.urdf_elements import Tree, read_elements
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
-LIMITS: Final = Check.of(tuple[Annotated[Number, Ge(-30.0), Le(30.0)], ...], bare=True)
-SPEEDS: Final = Check.of(tuple[Positive, ...], bare=True)
-MASS: Final = Check.of(Mass, bare=True)
-USUAL_LIMIT: Final = 4.0 * pi  # [rad]
-USUAL_SPEEDS: Final = (0.01, 20.0)  # [rad/s]
-UNLIMITED: Final = 1e3  # [rad], [rad/s] from which on a limit is none
-DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side, where a joint's limit is not given
-DEFAULT_SPEED: Final = pi  # [rad/s] where a joint's limit is not given
-DEFAULTS: Final = "±2π rad and π rad/s"
+LIMITS = Check.of(tuple[Annotated[Number, Ge(-30.0), Le(30.0)], ...], bare=True)
+SPEEDS = Check.of(tuple[Positive, ...], bare=True)
+MASS = Check.of(Mass, bare=True)
+USUAL_LIMIT = 4.0 * pi  # [rad]
+USUAL_SPEEDS = (0.01, 20.0)  # [rad/s]
+UNLIMITED = 1e3  # [rad], [rad/s] from which on a limit is none
+DEFAULT_RANGE = 2.0 * pi  # [rad] to either side, where a joint's limit is not given
+DEFAULT_SPEED = pi  # [rad/s] where a joint's limit is not given
+DEFAULTS = "±2π rad and π rad/s"
 # Share of the largest principal moment by which the others' sum is above it despite rounding
-INERTIA_MARGIN: Final = 1e-6  # [1]
+INERTIA_MARGIN = 1e-6  # [1]
 # Share of itself by which the largest principal moment may exceed the others' sum without a remark
-ROUNDED_INERTIA: Final = 5e-3  # [1]
+ROUNDED_INERTIA = 5e-3  # [1]
 # Share of itself by which it exceeds the others' sum in no real file
-FLAT_INERTIA: Final = 0.9  # [1]
+FLAT_INERTIA = 0.9  # [1]
 # Largest radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
-MAX_GYRATION: Final = 2.0 / 3.0  # [1]
+MAX_GYRATION = 2.0 / 3.0  # [1]
 # Density of osmium, whose sphere has the least inertia of a mass
-MAX_DENSITY: Final = 22_600.0  # [kg/m³]
+MAX_DENSITY = 22_600.0  # [kg/m³]
 
 
 def read_urdf_robot(path: Path, tip: str) -> Robot:

@@ -12,7 +12,7 @@ along its axis to the tube's side, along the tube, and to the next joint, as the
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,13 @@ from servobench.plant.robot.arm import SerialArm, freeze_arrays
 from servobench.plant.robot.camera import CAMERA, IntArray, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
-CENTRE: Final = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
-CAMERA_DISTANCE: Final = 1.3  # [m] from the camera to the workspace's centre, for a UR5
-BALL_RADIUS: Final = 0.035  # [m] for a UR5
+CENTRE = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
+CAMERA_DISTANCE = 1.3  # [m] from the camera to the workspace's centre, for a UR5
+BALL_RADIUS = 0.035  # [m] for a UR5
 # [m] from a UR5's shoulder to the ball: away from the column and from the stretched arm
-REACH: Final = (0.35, 0.75)
+REACH = (0.35, 0.75)
 # The camera hangs above the workspace and looks straight down; image up is +x of the base.
-R_BC_DOWN: Final = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+R_BC_DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 Clear = Callable[[FloatArray], BoolArray]
 Pair = tuple[FloatArray, FloatArray]  # (n,) and (n,)
@@ -94,23 +94,19 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
 
 
 # The lengths of the criteria are those of a UR5.
-MIN_LINK_HEIGHT: Final = (
-    0.03  # [m] least height of a link above the table, in addition to its radius
-)
-MIN_BALL_HEIGHT: Final = 0.08  # [m] least height of the ball's centre above the table
-MAX_OVERLAP: Final = 0.02  # [m] overlap that is no contact yet, as the tubes are schematic
+MIN_LINK_HEIGHT = 0.03  # [m] least height of a link above the table, in addition to its radius
+MIN_BALL_HEIGHT = 0.08  # [m] least height of the ball's centre above the table
+MAX_OVERLAP = 0.02  # [m] overlap that is no contact yet, as the tubes are schematic
 # Two tubes that overlap in more than this share of random postures count as built into each other.
-BUILT_IN_SHARE: Final = 0.4  # [1]
+BUILT_IN_SHARE = 0.4  # [1]
 # Share of the image's half sides in which the ball is, with a margin for a turned camera
-IMAGE_SHARE: Final = 0.8  # [1]
-MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian
-STOP_MARGIN: Final = 0.25  # [rad] least distance from a joint's stop
+IMAGE_SHARE = 0.8  # [1]
+MIN_GAIN = 0.18  # [m/rad] least singular value of the position Jacobian
+STOP_MARGIN = 0.25  # [rad] least distance from a joint's stop
 # Radii of an arm's tubes over that of their link: of the piece beside the joint, and of the long one
-ASIDE_RADIUS: Final = 0.8  # [1]
-LINK_RADIUS: Final = 0.95  # [1]
-MIN_TUBE_LENGTH: Final = (
-    1e-3  # [m] least length of a tube between a joint's side and the next joint
-)
+ASIDE_RADIUS = 0.8  # [1]
+LINK_RADIUS = 0.95  # [1]
+MIN_TUBE_LENGTH = 1e-3  # [m] least length of a tube between a joint's side and the next joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,40 +255,38 @@ def segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
     return norm(p1 + s[..., None] * d1 - p2 - t[..., None] * d2)
 
 
-LENGTH_OF_UR5: Final = 1.10335  # [m] from its shoulder along the links to the flange
-TOOL: Final = 0.10  # [m] from the flange to the ball, for a UR5
-HOME_POINT: Final = (0.5, 0.0, 0.3)  # [m] the ball at home, for a UR5
-STRETCHED_POINT: Final = (3.0, 0.0, 0.1)  # [m] out of reach: the arm points there; for a UR5
+LENGTH_OF_UR5 = 1.10335  # [m] from its shoulder along the links to the flange
+TOOL = 0.10  # [m] from the flange to the ball, for a UR5
+HOME_POINT = (0.5, 0.0, 0.3)  # [m] the ball at home, for a UR5
+STRETCHED_POINT = (3.0, 0.0, 0.1)  # [m] out of reach: the arm points there; for a UR5
 # The workspace is lifted by these heights until enough postures are fit; for a UR5.
-HEIGHTS: Final = (0.0, 0.1, 0.2)  # [m]
+HEIGHTS = (0.0, 0.1, 0.2)  # [m]
 # The ball in the base frame of a UR5 at start and target of each move [m].
-MOVES: Final = {
+MOVES = {
     "exp1": ((0.50, -0.10, 0.35), (0.15, 0.58, 0.30)),
     "exp2": ((0.40, -0.15, 0.45), (0.60, 0.10, 0.20)),
     "exp3": ((0.62, 0.22, 0.20), (0.45, -0.25, 0.40)),
     "exp4": ((0.12, -0.55, 0.50), (0.55, 0.05, 0.25)),
 }
 
-STARTS: Final = 512  # starts of the search for a home
-CANDIDATES: Final = 12  # homes whose surroundings are sampled
+STARTS = 512  # starts of the search for a home
+CANDIDATES = 12  # homes whose surroundings are sampled
 # A home is the worse, the further its joints are from zero; for a UR5.
-WINDING_COST: Final = 0.03  # [m/rad²]
-NEIGHBOURS: Final = 192  # sampled postures in a box
-NEAR_STARTS: Final = 96  # starts of the search for a posture near the home
-NEAR_DEVIATION: Final = 0.4  # [rad] standard deviation of those starts from the home
-HALF_BOX: Final = 0.6  # [rad] half sides of the box
-LAST_HALF: Final = 0.3  # [rad] half side for the last joint, which moves the ball little
+WINDING_COST = 0.03  # [m/rad²]
+NEIGHBOURS = 192  # sampled postures in a box
+NEAR_STARTS = 96  # starts of the search for a posture near the home
+NEAR_DEVIATION = 0.4  # [rad] standard deviation of those starts from the home
+HALF_BOX = 0.6  # [rad] half sides of the box
+LAST_HALF = 0.3  # [rad] half side for the last joint, which moves the ball little
 # Factors on the box until enough postures in it are fit
-SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)
-ENOUGH: Final = 0.7  # share of fit postures in a box that ends the search for a smaller one
-GOOD_BOX: Final = ENOUGH * 0.8  # fit share times size of a box that ends the search for a height
-MOVE_STARTS: Final = 24  # number of starts that are tried for a move
-PATH_STEPS: Final = 40  # steps on the path of a move
-WITHDRAWALS: Final = 8  # steps of a tenth towards the home if no fit posture reaches a position
-PINV_CUTOFF: Final = (
-    0.02  # [1] singular values on a path below this share of the largest count as 0
-)
-STOP_DISTANCE: Final = 0.1  # [rad] distance of a stretched posture from the joints' stops
+SHRINK = (1.0, 0.85, 0.7, 0.55, 0.4)
+ENOUGH = 0.7  # share of fit postures in a box that ends the search for a smaller one
+GOOD_BOX = ENOUGH * 0.8  # fit share times size of a box that ends the search for a height
+MOVE_STARTS = 24  # number of starts that are tried for a move
+PATH_STEPS = 40  # steps on the path of a move
+WITHDRAWALS = 8  # steps of a tenth towards the home if no fit posture reaches a position
+PINV_CUTOFF = 0.02  # [1] singular values on a path below this share of the largest count as 0
+STOP_DISTANCE = 0.1  # [rad] distance of a stretched posture from the joints' stops
 
 
 def length_scale(arm: SerialArm) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Final, Literal, NamedTuple, final
+from typing import Literal, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -32,9 +32,9 @@ from servobench.plant.contract.settings import (
 )
 from servobench.plant.contract.signals import BoolArray, Observation
 
-_MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
-_MAX_FORGETTING: Final = 20.0  # [1] a block, after which an error weighs 2e-9 of the present one
-_MIN_ROOM: Final = 1e-12  # [rad/s] room of a joint whose command is at the acceleration limit
+_MIN_MULTIPLIER = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
+_MAX_FORGETTING = 20.0  # [1] a block, after which an error weighs 2e-9 of the present one
+_MIN_ROOM = 1e-12  # [rad/s] room of a joint whose command is at the acceleration limit
 
 
 @settings

@@ -21,7 +21,7 @@ import io
 import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any, Final, Literal, NamedTuple, TypeAlias, final
+from typing import Any, Literal, NamedTuple, TypeAlias, final
 
 import daqp
 import numpy as np
@@ -32,9 +32,9 @@ from servobench.plant.contract.signals import BoolArray, PlantSpec
 
 Solver: TypeAlias = Literal["daqp", "qpoases"]
 # Tolerances are those of the constraints in rad: far below an encoder step, far above rounding.
-_DAQP_OPTIONS: Final = {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}
-_QPOASES_OPTIONS: Final = {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12}
-_DAQP_STATUS: Final = {
+_DAQP_OPTIONS = {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}
+_QPOASES_OPTIONS = {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12}
+_DAQP_STATUS = {
     -1: "infeasible", -2: "cycling", -3: "unbounded", -4: "iteration limit reached", -5: "not convex",
     -6: "overdetermined",
 }  # fmt: skip

@@ -8,7 +8,7 @@ import sys
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -17,13 +17,13 @@ from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, write_atomically
 
-TEMPLATES: Final = files("servobench.harness.apps.check") / "templates"
-PREFIX: Final = "test_"
-NEXT: Final = {  # kind of a new file -> the next commands
+TEMPLATES = files("servobench.harness.apps.check") / "templates"
+PREFIX = "test_"
+NEXT = {  # kind of a new file -> the next commands
     "controller": ("check {}", "run --controller {} --plant kinematic"),
     "plant": ("check plant {}", "run --plant {}"),
 }
-COLOURS: Final = {"ok": "green", "failed": "bold red", "note": "yellow"}
+COLOURS = {"ok": "green", "failed": "bold red", "note": "yellow"}
 
 
 def new(

@@ -5,7 +5,7 @@ import io
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, Final, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -41,20 +41,20 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Observation, trusted_observation
 
 JOINTS, FEATURES = 6, 3
-OTHER_SIZES: Final = (7, 2)
-STEPS: Final = 24
-STEPS_IF_SLOW: Final = 4
-SLOW: Final = 0.02  # [s] a step, beyond which runs are short
-LIMIT_TOLERANCE: Final = 1e-9
-APPROACH: Final = 3.0  # [s] after which the error should have become smaller
-OTHER_PERIOD: Final = 0.02  # [s]
-LOSSES: Final = (range(1, 4), range(3), range(10, 20))  # periods in which the feature is lost
-ROUGH: Final = (1e-3, 1e3, 1e6)  # scales of features
-ONE_BY_ONE: Final = (
+OTHER_SIZES = (7, 2)
+STEPS = 24
+STEPS_IF_SLOW = 4
+SLOW = 0.02  # [s] a step, beyond which runs are short
+LIMIT_TOLERANCE = 1e-9
+APPROACH = 3.0  # [s] after which the error should have become smaller
+OTHER_PERIOD = 0.02  # [s]
+LOSSES = (range(1, 4), range(3), range(10, 20))  # periods in which the feature is lost
+ROUGH = (1e-3, 1e3, 1e6)  # scales of features
+ONE_BY_ONE = (
     "its runs go one by one; those of a Law and an Estimator in a Servo may advance together"
 )
-IN_LANES: Final = "its parts must be pure and take arrays with leading axes, see servobench/plant/contract/lanes.py"
-SEED_REMEDY: Final = "make one in reset: self.rng = np.random.default_rng(seed)"
+IN_LANES = "its parts must be pure and take arrays with leading axes, see servobench/plant/contract/lanes.py"
+SEED_REMEDY = "make one in reset: self.rng = np.random.default_rng(seed)"
 
 
 def check_controller(

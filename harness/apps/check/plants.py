@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable
-from typing import Final
 
 import numpy as np
 
@@ -15,29 +14,29 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 
-PERIOD: Final = 0.05  # [s]
-OTHER: Final = "panda", 0.1  # a second robot, and its period [s]
-MISMATCH: Final = "moderate+gear_ratio=5%"
-STEPS: Final = 6
-SHARE: Final = 0.5  # share of the joint-speed limits within which commands are drawn
+PERIOD = 0.05  # [s]
+OTHER = "panda", 0.1  # a second robot, and its period [s]
+MISMATCH = "moderate+gear_ratio=5%"
+STEPS = 6
+SHARE = 0.5  # share of the joint-speed limits within which commands are drawn
 # [rad] by which the first and the last joint are moved, those between by lengths between
-MOTION: Final = (0.05, 0.1)
+MOTION = (0.05, 0.1)
 # [s] Length of such a motion and of the rest after it, which is longer than usual delays.
 MOTION_TIME, REST_TIME = (0.5, 1.0)
-TURN: Final = (
+TURN = (
     0.2  # [rad] of the first joint at the start, so that no feature of the two robots is near zero
 )
-START_TOLERANCE: Final = 0.01  # [rad]
-FOLLOWING: Final = (0.6, 1.6)  # a motion over the commanded one
-SAMPLES: Final = 5  # last features at rest, whose median has little noise and no outliers
-FEATURE_TOLERANCE: Final = 0.05  # share of the feature, or of its natural size if that is larger
-NOMINAL_SHARE: Final = (
+START_TOLERANCE = 0.01  # [rad]
+FOLLOWING = (0.6, 1.6)  # a motion over the commanded one
+SAMPLES = 5  # last features at rest, whose median has little noise and no outliers
+FEATURE_TOLERANCE = 0.05  # share of the feature, or of its natural size if that is larger
+NOMINAL_SHARE = (
     0.2  # of the distance from the true model, within which a plant is that of the nominal model
 )
-CLIPPED_STEPS: Final = 4  # more than a usual command delay
-JACOBIAN_STEPS: Final = 4  # steps of a slow motion that the true Jacobian has to predict
-JACOBIAN_TOLERANCE: Final = 0.05  # share of the motion of the feature
-MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which the Jacobian cannot be judged
+CLIPPED_STEPS = 4  # more than a usual command delay
+JACOBIAN_STEPS = 4  # steps of a slow motion that the true Jacobian has to predict
+JACOBIAN_TOLERANCE = 0.05  # share of the motion of the feature
+MIN_MOTION = 1e-3  # [natural size of the feature], below which the Jacobian cannot be judged
 
 
 def check_plant(

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
+from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from servobench.harness.run.result import WrongAnswer, beginning
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
-WIDTH: Final = 14  # [characters] width of the names of checks in print
-HAPPENS: Final = "; this happens with "  # begin of the notes of `naming`
+WIDTH = 14  # [characters] width of the names of checks in print
+HAPPENS = "; this happens with "  # begin of the notes of `naming`
 
 
 class Finding(NamedTuple):

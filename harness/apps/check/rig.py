@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,13 +23,13 @@ from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
-PERIOD: Final = 0.05  # [s]
-PREVIEW: Final = 10  # [rows]
-MAX_PERIODS: Final = 1000  # length of a run in periods
-BEND: Final = 0.02  # [1/rad²]
-MODEL_ERROR: Final = 1.05  # nominal over true Jacobian
-NOISE: Final = 1e-3  # [m] noise of the feature
-SMALL_TRAINING: Final = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
+PERIOD = 0.05  # [s]
+PREVIEW = 10  # [rows]
+MAX_PERIODS = 1000  # length of a run in periods
+BEND = 0.02  # [1/rad²]
+MODEL_ERROR = 1.05  # nominal over true Jacobian
+NOISE = 1e-3  # [m] noise of the feature
+SMALL_TRAINING = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 
 
 @dataclass

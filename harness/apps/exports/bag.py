@@ -12,7 +12,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,12 +29,12 @@ from servobench.plant.contract.signals import COMMAND
 from servobench.plant.rendered import urdf
 from servobench.plant.robot.camera import PinholeCamera
 
-UNTURNED: Final = np.eye(3)  # a rotation
-CAMERA: Final = "camera"  # frame: z along the optical axis, x right and y down in the image
-SIGNALS: Final = ("reference", "true_feature", "feature")
-GROUPS: Final = (COMMAND, "joint_position", *SIGNALS)  # kinds of columns
-MESH: Final = re.compile(r'<mesh filename="ball.obj" scale="(\S+) [^>]*>')
-FLYING: Final = """
+UNTURNED = np.eye(3)  # a rotation
+CAMERA = "camera"  # frame: z along the optical axis, x right and y down in the image
+SIGNALS = ("reference", "true_feature", "feature")
+GROUPS = (COMMAND, "joint_position", *SIGNALS)  # kinds of columns
+MESH = re.compile(r'<mesh filename="ball.obj" scale="(\S+) [^>]*>')
+FLYING = """
   <link name="measured"><visual><geometry><sphere radius="{radius}" /></geometry>
     <material name="yellow"><color rgba="1.0 0.8 0.1 0.6" /></material></visual></link>
   <link name="reference"><visual><geometry><sphere radius="{radius}" /></geometry>
@@ -42,7 +42,7 @@ FLYING: Final = """
   <joint name="measured" type="floating"><parent link="base" /><child link="measured" /></joint>
   <joint name="reference" type="floating"><parent link="base" /><child link="reference" /></joint>
 </robot>"""
-KINDS: Final = {  # topic, or its first part, -> kind of message
+KINDS = {  # topic, or its first part, -> kind of message
     "robot_description": "std_msgs/msg/String",
     "joint_states": "sensor_msgs/msg/JointState",
     "forward_velocity_controller": "std_msgs/msg/Float64MultiArray",
@@ -53,11 +53,11 @@ KINDS: Final = {  # topic, or its first part, -> kind of message
     "steps": "std_msgs/msg/Float64",
     **dict.fromkeys(SIGNALS, "geometry_msgs/msg/PointStamped"),
 }
-LINE_STRIP: Final = 4  # types of markers
-LINE_LIST: Final = 5
-LINE_WIDTH: Final = 0.003  # [m]
-GREEN: Final = (0.1, 0.7, 0.3)
-RED: Final = (0.9, 0.1, 0.1)
+LINE_STRIP = 4  # types of markers
+LINE_LIST = 5
+LINE_WIDTH = 0.003  # [m]
+GREEN = (0.1, 0.7, 0.3)
+RED = (0.9, 0.1, 0.1)
 Message = dict[str, Any]  # fields by name; those that are missing are 0 or empty
 
 

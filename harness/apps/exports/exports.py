@@ -3,7 +3,6 @@
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import pandas as pd
 
@@ -13,8 +12,8 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, write_atomically, write_csv, writing_together
 
 CSV, MCAP = "csv", "mcap"
-FORMATS: Final = (CSV, MCAP)
-LAYOUT: Final = "foxglove_layout.json"
+FORMATS = (CSV, MCAP)
+LAYOUT = "foxglove_layout.json"
 
 
 def export_folder(

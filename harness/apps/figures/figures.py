@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -64,8 +64,8 @@ class Kind(NamedTuple):
     in_page: bool = True  # whether the report shows it
 
 
-_KINDS_FILE: Final = Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8")
-KINDS: Final = {name: Kind(**kind) for name, kind in tomllib.loads(_KINDS_FILE).items()}
+_KINDS_FILE = Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8")
+KINDS = {name: Kind(**kind) for name, kind in tomllib.loads(_KINDS_FILE).items()}
 
 
 class NamedFigure(NamedTuple):

@@ -6,7 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -39,19 +39,19 @@ from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.checks import FloatArray
 
-SETTLING: Final = "settling_time_s"
-NEVER: Final = 1.3  # [1] place of a run that never settled, over the largest settling time
-FIGURES: Final = ("settling", "effort", "smoothness", "own")  # each shows the metrics that name it
+SETTLING = "settling_time_s"
+NEVER = 1.3  # [1] place of a run that never settled, over the largest settling time
+FIGURES = ("settling", "effort", "smoothness", "own")  # each shows the metrics that name it
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
-LINE: Final = 0.165  # [in] a controller
-WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
-MAX_RANGE: Final = 1e6  # largest over smallest value that an axis shows
-NAME_LETTERS: Final = 20  # letters of a controller's name at an axis, for each column of a layout
-LETTERS: Final = 16.0  # letters of a label in an inch
-NUMBERS: Final = 0.25  # [in] next to the names
-MIN_ROWS: Final = 4  # controllers for which a panel has room
-UPPER: Final = 0.97  # [1] share of a panel's height at which the mark of an infinite value stands
-LINE_LETTERS: Final = 30  # letters of a line of text within a panel
+LINE = 0.165  # [in] a controller
+WIDE_RANGE = 30.0  # largest over smallest value from which on an axis is logarithmic
+MAX_RANGE = 1e6  # largest over smallest value that an axis shows
+NAME_LETTERS = 20  # letters of a controller's name at an axis, for each column of a layout
+LETTERS = 16.0  # letters of a label in an inch
+NUMBERS = 0.25  # [in] next to the names
+MIN_ROWS = 4  # controllers for which a panel has room
+UPPER = 0.97  # [1] share of a panel's height at which the mark of an infinite value stands
+LINE_LETTERS = 30  # letters of a line of text within a panel
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 

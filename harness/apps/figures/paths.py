@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -26,22 +26,22 @@ from servobench.harness.apps.figures.style import (
 from servobench.harness.apps.figures.tracks import Track, Tracks, TracksByTask, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
-COLUMNS: Final = 2
-SINGLE: Final = 3.6  # [in] width of the only view of a wide figure
-BESIDE: Final = 0.8  # [in] for the numbers beside a view
-LINE: Final = 0.17  # [in] height of a line of the legend
+COLUMNS = 2
+SINGLE = 3.6  # [in] width of the only view of a wide figure
+BESIDE = 0.8  # [in] for the numbers beside a view
+LINE = 0.17  # [in] height of a line of the legend
 # [1] Least and largest height of a view over its width.
-SLIMMEST: Final = 0.3
-TALLEST: Final = 1.0
-ROOM: Final = 1.16  # [1] size of a view over that of the paths in it
-ARROW: Final = 0.06  # [1] share of a curve after which an arrow shows its direction
+SLIMMEST = 0.3
+TALLEST = 1.0
+ROOM = 1.16  # [1] size of a view over that of the paths in it
+ARROW = 0.06  # [1] share of a curve after which an arrow shows its direction
 # Labels of a feature in the frame of the camera.
-CAMERA_FRAME: Final = {
+CAMERA_FRAME = {
     "x_m": "x, to the right [m]",
     "y_m": "y, downwards [m]",
     "z_m": "z, depth downwards [m]",
 }
-PIXELS: Final = "px"  # unit of a feature in an image, where the second one of a pair points down
+PIXELS = "px"  # unit of a feature in an image, where the second one of a pair points down
 
 
 class View(NamedTuple):

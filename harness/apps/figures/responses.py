@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from operator import itemgetter
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -59,24 +58,24 @@ from servobench.harness.apps.figures.tracks import (
 )
 from servobench.plant.contract.checks import FloatArray
 
-COLUMNS: Final = 2
-LINE: Final = 0.17  # [in] height of a line of the legend
+COLUMNS = 2
+LINE = 0.17  # [in] height of a line of the legend
 DrawPanel = Callable[[Axes, Ensembles, Styles], None]
-COMMAND: Final = "joint_velocity_command_"
-ROW: Final = 0.72  # [in] a controller
+COMMAND = "joint_velocity_command_"
+ROW = 0.72  # [in] a controller
 # A column of panels each: its title, the metric written into it, and its form
-QUANTITIES: Final = (
+QUANTITIES = (
     ("joint speed [rad/s]", "command_switches", "{:.0f} sign switches"),
     ("acceleration [rad/s²]", "joint_acceleration_rms_rad_s2", "RMS {:.3g}"),
     ("jerk [rad/s³]", "joint_jerk_rms_rad_s3", "RMS {:.3g}"),
 )
-MARK_SIZE: Final = 6.5  # [points] width of the mark at a settling time
-EXACT: Final = 1e-7  # [%] error of an estimate that counts as the truth
-AXIS_ROOM: Final = 1.3  # [1] length of an axis over the largest error after the approach
-NEAR: Final = 0.02  # [1] share of a time axis within which marks stand side by side
-FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
-OUTSIDE: Final = 1e12  # a number that is outside of every picture
-MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
+MARK_SIZE = 6.5  # [points] width of the mark at a settling time
+EXACT = 1e-7  # [%] error of an estimate that counts as the truth
+AXIS_ROOM = 1.3  # [1] length of an axis over the largest error after the approach
+NEAR = 0.02  # [1] share of a time axis within which marks stand side by side
+FLOOR = 0.1  # settling bands: the least error that is shown over time
+OUTSIDE = 1e12  # a number that is outside of every picture
+MAX_ERROR = 1e6  # [error unit] up to which an axis reaches
 
 
 def draw_moves(tasks: Tasks, styles: Styles, layout: Layout = WIDE) -> Figure:

@@ -14,7 +14,7 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import matplotlib as mpl
 import numpy as np
@@ -31,24 +31,24 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.units import split_quantity
 
-_SHEET: Final = tomllib.loads(
+_SHEET = tomllib.loads(
     (files("servobench.harness.apps.figures") / "style.toml").read_text(encoding="utf-8")
 )
-COLOURS: Final[dict[str, str]] = _SHEET["colours"]
+COLOURS: dict[str, str] = _SHEET["colours"]
 MARKS = 8  # markers on each line
 WIDTH = 7.2  # [in] width of a figure: both columns of a paper
 MAX_LINES = 7  # methods in a panel, not counting those that know the true robot
 TEXT = 8.0  # [pt] size of text in a figure of that width
 FILM_TEXT = 9.0  # [pt]
 FORMATS = ("png", "pdf")
-ALL_FORMATS: Final = (*FORMATS, "svg", "pgf")
+ALL_FORMATS = (*FORMATS, "svg", "pgf")
 # Unit -> how many of it are an inch
-INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4, "pt": 72.27}
-TWO_COLUMNS: Final = 5.0  # [in] from which on panels stand beside each other
-PGF_TEXT: Final = re.compile(r"(?<=\\def%\{\\%\}).*(?=\}\}%$)", re.MULTILINE)
-UNDERSCORE: Final = re.compile(r"(\$[^$]*\$)|(?<!\\)_")  # a formula, or an underscore outside
-TEX: Final = ("pdflatex", "lualatex", "xelatex")  # programs with which pgf measures its text
-UNDATED: Final[dict[str, Any]] = {
+INCHES = {"in": 1.0, "cm": 2.54, "mm": 25.4, "pt": 72.27}
+TWO_COLUMNS = 5.0  # [in] from which on panels stand beside each other
+PGF_TEXT = re.compile(r"(?<=\\def%\{\\%\}).*(?=\}\}%$)", re.MULTILINE)
+UNDERSCORE = re.compile(r"(\$[^$]*\$)|(?<!\\)_")  # a formula, or an underscore outside
+TEX = ("pdflatex", "lualatex", "xelatex")  # programs with which pgf measures its text
+UNDATED: dict[str, Any] = {
     "pdf": {"metadata": {"CreationDate": None}},
     "svg": {"metadata": {"Date": None}},
     "png": {"metadata": {"Software": None}},
@@ -61,15 +61,15 @@ END = "|"  # the marker of an early end, which no method has
 SETTLED = "settled from here on"
 CAMERA_MOVES = "camera moves"
 # Entries of a legend that begin so are no methods and stand behind these.
-NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)
+NOT_METHODS = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)
 # [1] Upper over lower end of a logarithmic axis below which 2 and 5 have numbers as well.
-FEW_DECADES: Final = 50.0
+FEW_DECADES = 50.0
 LETTER = 0.066  # [in] width of a letter of the legend
 SAMPLE = 0.55  # [in] width of the sample line of a legend
-MARGIN: Final = 0.2  # [in] on both sides of the legend
-DESIRED: Final[dict[str, Any]] = _SHEET["desired"]
-BOX: Final[dict[str, Any]] = _SHEET["box"]  # around words in a panel
-MARKS_OF: Final[dict[str, dict[str, Any]]] = _SHEET["marks"]
+MARGIN = 0.2  # [in] on both sides of the legend
+DESIRED: dict[str, Any] = _SHEET["desired"]
+BOX: dict[str, Any] = _SHEET["box"]  # around words in a panel
+MARKS_OF: dict[str, dict[str, Any]] = _SHEET["marks"]
 DASHED = (0, (3.5, 1.5))  # line of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 
@@ -81,7 +81,7 @@ def _line(text: str) -> Any:  # noqa: ANN401 - matplotlib's own types
     return text
 
 
-JOINTS: Final = [
+JOINTS = [
     (COLOURS[colour], _line(line))
     for colour, line in zip(_SHEET["joints"]["colours"], _SHEET["joints"]["lines"], strict=True)
 ]

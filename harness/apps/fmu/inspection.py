@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from fmpy.validation import validate_fmu as validate_by_fmpy
@@ -29,7 +29,7 @@ from servobench.plant.fmu.description import (
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
 
-MAX_START: Final = 1e12  # [s] A larger clock loses steps of milliseconds.
+MAX_START = 1e12  # [s] A larger clock loses steps of milliseconds.
 TOLERANCE = 1e-9  # [1] largest relative difference of a run from the reference
 
 

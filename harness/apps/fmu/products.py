@@ -6,7 +6,6 @@ The step of a controller is recorded, and a run of it is kept inside the FMU for
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
-from typing import Final
 
 import numpy as np
 
@@ -41,10 +40,10 @@ from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import find_robot
 
-REFERENCE_PERIODS: Final = 200  # most periods of the run inside the FMU
-TOLERANCE: Final = 1e-9
-STRETCH: Final = 5  # periods, compared on their own where learning magnifies rounding errors
-USUAL: Final = KinematicConfig()  # lag and limits of an exported arm
+REFERENCE_PERIODS = 200  # most periods of the run inside the FMU
+TOLERANCE = 1e-9
+STRETCH = 5  # periods, compared on their own where learning magnifies rounding errors
+USUAL = KinematicConfig()  # lag and limits of an exported arm
 
 
 def controller_model(request: RunRequest, settings: Settings) -> ControllerModel:

@@ -13,7 +13,7 @@ feedforward of it does not pass for feedback. Adaptation in the small motions is
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -62,7 +62,7 @@ MAX_MOTION = 0.1  # [m] beyond it a loop is not at small motions any more
 STEP_DURATION = 4.0  # [s] length of the step responses
 FAST_POINTS = 150  # frequencies where only the delay margin is wanted
 # Heading in a terminal -> column, factor, digits
-MARGIN_COLUMNS: Final = {
+MARGIN_COLUMNS = {
     "gain\nmargin": ("gain_margin", 1.0, 2),
     "phase\nmargin, °": ("phase_margin_deg", 1.0, 0),
     "delay\nmargin, ms": ("delay_margin_s", 1000.0, 0),
@@ -71,7 +71,7 @@ MARGIN_COLUMNS: Final = {
     "over-\nshoot, %": ("overshoot", 100.0, 0),
 }
 # The same where limits were simulated, too
-SIMULATED_COLUMNS: Final = {
+SIMULATED_COLUMNS = {
     "gain\nmargin": ("gain_margin", 1.0, 2),
     "gain,\nsimulated": ("simulated_gain_margin", 1.0, 2),
     "latency\nlimit, ms": ("latency_limit_s", 1000.0, 0),

@@ -7,7 +7,7 @@ import tomllib
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, final
+from typing import Any, final
 
 import viser
 from viser.extras import ViserUrdf
@@ -18,8 +18,8 @@ from servobench.plant.bench.bench import turned_about_axis
 from servobench.plant.rendered.room import Room
 from servobench.plant.robot.catalogue import find_robot
 
-PAGE: Final = tomllib.loads(files(__package__).joinpath("page.toml").read_text(encoding="utf-8"))
-SPACING: Final = 1.9  # [m] between the bases of two arms
+PAGE = tomllib.loads(files(__package__).joinpath("page.toml").read_text(encoding="utf-8"))
+SPACING = 1.9  # [m] between the bases of two arms
 
 
 @final

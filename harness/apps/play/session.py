@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any, Final, final
+from typing import Any, final
 
 import numpy as np
 
@@ -30,10 +30,8 @@ from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.robot.catalogue import find_robot
 
-KNOCK_AXIS: Final = np.array(
-    [0.28, 0.0, 0.96]
-)  # in the frame of the camera, nearly its optical axis
-HISTORY: Final = 20.0  # [s] time over which errors are kept
+KNOCK_AXIS = np.array([0.28, 0.0, 0.96])  # in the frame of the camera, nearly its optical axis
+HISTORY = 20.0  # [s] time over which errors are kept
 
 
 @final

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -12,7 +12,7 @@ from servobench.harness.cli import selection
 from servobench.harness.cli.options import MetricsOption, option
 from servobench.harness.cli.terminal import console, say
 
-SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
+SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 
 
 def report(

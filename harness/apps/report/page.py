@@ -11,7 +11,7 @@ import math
 import re
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -49,21 +49,21 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import accessing, write_atomically
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 
-NAME: Final = "report.html"
-TEMPLATE: Final = "report.html.j2"
-OWN: Final = Path(__file__).parent  # folder of template, style and scripts
-PICTURE_BYTES: Final = 3_000_000  # size of all figures in the page together
-SHOWN_RUNS: Final = 1000  # rows of the table of runs
-LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
-COUNTED: Final = {
+NAME = "report.html"
+TEMPLATE = "report.html.j2"
+OWN = Path(__file__).parent  # folder of template, style and scripts
+PICTURE_BYTES = 3_000_000  # size of all figures in the page together
+SHOWN_RUNS = 1000  # rows of the table of runs
+LONG_TABLE = 30  # rows; of a table that has more, the page shows a line that opens it
+COUNTED = {
     "controller": "controllers",
     "task": "tasks",
     "plant": "plants",
     "mismatch": "mismatches",
 }
 # The scope of a page mentions these columns only where they differ from the default.
-USUAL: Final = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}
-SWEPT: Final = {
+USUAL = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}
+SWEPT = {
     "noise_factor": "factors of noise",
     "latency_s": "latencies",
     "period_s": "control periods",
@@ -77,23 +77,23 @@ NUMBER_BYTES = 6  # size of one number in the page
 STEPS_AT_ONCE = 64  # runs whose steps are in memory at a time
 DIGITS = 4  # significant digits of a number in the page
 # [px] Lengths of strokes and gaps of matplotlib's named line styles.
-DASHES: Final[dict[str, list[float]]] = {
+DASHES: dict[str, list[float]] = {
     "-": [],
     "--": [7, 4],
     "-.": [8, 3, 2, 3],
     ":": [2, 3],
 }
 Json = dict[str, Any]
-ESTIMATE: Final = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<high>[^,\[\]]+)\]")
-NUMBER: Final = re.compile(r"[-+]?(\d|∞|–$)")
+ESTIMATE = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<high>[^,\[\]]+)\]")
+NUMBER = re.compile(r"[-+]?(\d|∞|–$)")
 # Signs after which a long name may go on in the next line
-BREAKS: Final = re.compile(r"([_:+=/,.])")
-TICKED: Final = re.compile(r"`([^`]*)`")
-CONTROLLER: Final = (tables.WHICH, "controller")
-INFINITE: Final = "∞"
-LENGTHY: Final = 24  # letters from which on a word may be broken anywhere
-PHONE_COLUMNS: Final = 4  # columns of a table that fit on a phone
-TABLET_COLUMNS: Final = 8
+BREAKS = re.compile(r"([_:+=/,.])")
+TICKED = re.compile(r"`([^`]*)`")
+CONTROLLER = (tables.WHICH, "controller")
+INFINITE = "∞"
+LENGTHY = 24  # letters from which on a word may be broken anywhere
+PHONE_COLUMNS = 4  # columns of a table that fit on a phone
+TABLET_COLUMNS = 8
 
 
 class Picture(NamedTuple):

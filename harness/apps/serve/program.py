@@ -9,7 +9,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any, Final, final
+from typing import Any, final
 
 import numpy as np
 
@@ -19,17 +19,17 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
 
 # The date that a control script has in it
-STAMP: Final = re.compile(rb"Script Loaded \(([\w.: -]{1,40})\)")
+STAMP = re.compile(rb"Script Loaded \(([\w.: -]{1,40})\)")
 # Which no line of HTTP has, with any method
-SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")
-COMMAND: Final = "input_int_register_0"
-COMMANDS: Final = CONTROLLER["commands"]["names"].split()
-WITHOUT_ANSWER: Final = frozenset(CONTROLLER["commands"]["without_answer"])
-STOP_DECELERATION: Final = 10.0  # [rad/s²] deceleration of an arm whose program ended
-LONGEST_MOVE: Final = 300.0  # [s] with its settling
-POSITION_GAIN: Final = 5.0  # [1/s] gain of moveJ with which such a drive does not swing
-POSITION_TOLERANCE: Final = 1e-3  # [rad] within which moveJ has arrived
-UNLOCK_AFTER: Final = (
+SCRIPT_START = re.compile(rb"def [A-Za-z_]\w*\(")
+COMMAND = "input_int_register_0"
+COMMANDS = CONTROLLER["commands"]["names"].split()
+WITHOUT_ANSWER = frozenset(CONTROLLER["commands"]["without_answer"])
+STOP_DECELERATION = 10.0  # [rad/s²] deceleration of an arm whose program ended
+LONGEST_MOVE = 300.0  # [s] with its settling
+POSITION_GAIN = 5.0  # [1/s] gain of moveJ with which such a drive does not swing
+POSITION_TOLERANCE = 1e-3  # [rad] within which moveJ has arrived
+UNLOCK_AFTER = (
     5.0  # [s] that a protective stop lasts at least, by UR's page on the dashboard server
 )
 

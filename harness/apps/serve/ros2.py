@@ -13,7 +13,7 @@ an arm safe: it stands in for a robot that has its own limits.
 
 import math
 import time
-from typing import Any, Final, TypeAlias, final
+from typing import Any, TypeAlias, final
 
 import numpy as np
 import rclpy
@@ -30,13 +30,11 @@ from servobench.harness.apps.serve.wire import Say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Observation
 
-HEARTBEAT: Final = 0.05  # [s] after which lockstep repeats what it published
-SILENCE: Final = (
-    10.0  # [s] for which lockstep waits for a command by the wall clock, once one has come
-)
-QUEUE: Final = 10  # messages that wait for a slow reader
-NANOSECONDS: Final = 1_000_000_000  # in a second
-NEWER: Final = 1_000  # [ns] by which the stamp of a frame without a ball is later than the last one
+HEARTBEAT = 0.05  # [s] after which lockstep repeats what it published
+SILENCE = 10.0  # [s] for which lockstep waits for a command by the wall clock, once one has come
+QUEUE = 10  # messages that wait for a slow reader
+NANOSECONDS = 1_000_000_000  # in a second
+NEWER = 1_000  # [ns] by which the stamp of a frame without a ball is later than the last one
 News: TypeAlias = list[tuple[Any, Any]]  # publishers, each with its message
 
 

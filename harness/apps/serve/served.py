@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, final
+from typing import final
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 
-RATE: Final = 500.0  # [Hz] rate of the controller of an e-Series robot
-BACKLOG: Final = 0.1  # [s] behind the wall clock from which the backlog is dropped
-WATCHDOG: Final = 2.0  # [frames] without a command after which the arm stands
+RATE = 500.0  # [Hz] rate of the controller of an e-Series robot
+BACKLOG = 0.1  # [s] behind the wall clock from which the backlog is dropped
+WATCHDOG = 2.0  # [frames] without a command after which the arm stands
 
 
 @final

@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final, TypeAlias, final
+from typing import Any, TypeAlias, final
 
 import cv2
 
@@ -38,14 +38,14 @@ from servobench.plant.robot.catalogue import find_robot
 
 Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
 # All but the last are UR's
-PORTS: Final = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}
-HEARTBEAT: Final = 0.004  # [s] between two packets while lockstep waits
-SEND_BUFFER: Final = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
-PACKETS_A_PERIOD: Final = 50  # packets of a client in a period; the others wait
-SCRIPT_SIZE: Final = 1 << 20  # bytes of a script at most
-SCRIPT_END: Final = b"\nend\n"
-CONNECTIONS: Final = 32  # to a port at once
-LEGACY_FREQUENCY: Final = 125.0  # [Hz], at which version 1 of RTDE sends outputs
+PORTS = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}
+HEARTBEAT = 0.004  # [s] between two packets while lockstep waits
+SEND_BUFFER = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
+PACKETS_A_PERIOD = 50  # packets of a client in a period; the others wait
+SCRIPT_SIZE = 1 << 20  # bytes of a script at most
+SCRIPT_END = b"\nend\n"
+CONNECTIONS = 32  # to a port at once
+LEGACY_FREQUENCY = 125.0  # [Hz], at which version 1 of RTDE sends outputs
 
 
 @dataclass(eq=False)

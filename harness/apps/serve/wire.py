@@ -17,24 +17,24 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from itertools import islice
-from typing import Any, Final, Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
-CONTROLLER: Final = tomllib.loads(
+CONTROLLER = tomllib.loads(
     files(__package__).joinpath("controller.toml").read_text(encoding="utf-8")
 )
-MAX_NAMES: Final = 2048  # bytes of a list of names, by the guide
+MAX_NAMES = 2048  # bytes of a list of names, by the guide
 # Bytes of a packet of a client: a list of names with its frequency
-MAX_PACKET: Final = 3 + 8 + MAX_NAMES
-SIZES: Final = {"V": 5, "v": 3, "S": 3, "P": 3}  # bytes of the packets that have one size only
-KINDS: Final = {*SIZES, "O", "I", "U", "M"}  # those that a client sends
-MAX_LINE: Final = 4096  # bytes
+MAX_PACKET = 3 + 8 + MAX_NAMES
+SIZES = {"V": 5, "v": 3, "S": 3, "P": 3}  # bytes of the packets that have one size only
+KINDS = {*SIZES, "O", "I", "U", "M"}  # those that a client sends
+MAX_LINE = 4096  # bytes
 # HTTP, or bytes that are no text
-FOREIGN: Final = re.compile(rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]")
-NOT_FOUND: Final = "NOT_FOUND"
+FOREIGN = re.compile(rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]")
+NOT_FOUND = "NOT_FOUND"
 Say: TypeAlias = Callable[[str], None]  # prints a line for the user
-CODES: Final = CONTROLLER["codes"]  # type -> layout of struct
-ZEROS: Final = {kind: (0,) * int(code[:-1] or 1) for kind, code in CODES.items()}
-REGISTERS: Final = {"int": "INT32", "double": "DOUBLE"}
+CODES = CONTROLLER["codes"]  # type -> layout of struct
+ZEROS = {kind: (0,) * int(code[:-1] or 1) for kind, code in CODES.items()}
+REGISTERS = {"int": "INT32", "double": "DOUBLE"}
 
 
 def _types(way: str) -> dict[str, str]:
@@ -47,8 +47,8 @@ def _types(way: str) -> dict[str, str]:
     } | registers
 
 
-OUTPUTS: Final = _types("output")
-INPUTS: Final = _types("input")
+OUTPUTS = _types("output")
+INPUTS = _types("input")
 
 
 class WireError(ValueError):

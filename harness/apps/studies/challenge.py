@@ -23,7 +23,7 @@ from dataclasses import field, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
@@ -50,10 +50,10 @@ from servobench.plant.contract.settings import (
 )
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, with_camera
 
-GRADES: Final = ("I", "II", "III")
-SUFFIX: Final = ".toml"
-OWN_SECTIONS: Final = ("run.", "plant.", "task.")  # whose settings a challenge may change
-FOLDER: Final = files("servobench.harness.apps.studies") / "challenges"
+GRADES = ("I", "II", "III")
+SUFFIX = ".toml"
+OWN_SECTIONS = ("run.", "plant.", "task.")  # whose settings a challenge may change
+FOLDER = files("servobench.harness.apps.studies") / "challenges"
 
 
 class Measure(NamedTuple):
@@ -69,7 +69,7 @@ class Measure(NamedTuple):
     whole: bool = True  # whether a run whose outcome is bad is lost, or only one without a value
 
 
-MEASURES: Final[Mapping[str, Measure]] = {
+MEASURES: Mapping[str, Measure] = {
     "settling": Measure("settling_time_s", 0.05, 1.0, "s", "settled", "point_to_point", "moves"),
     "later": Measure(
         "settling_time_later_s", 0.05, 1.0, "s", "settled", "sequence", "sequences", whole=False

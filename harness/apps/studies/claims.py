@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 
@@ -44,35 +44,35 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.faults import ConfigurationError
 
-CLEAR_RATIO: Final = 2.0  # [1] ratio of step times, so large that every machine shows it
-MAX_CIRCLE_ERROR: Final = 0.010  # [m]
-MIN_CIRCLE_SHARE: Final = 0.8
+CLEAR_RATIO = 2.0  # [1] ratio of step times, so large that every machine shows it
+MAX_CIRCLE_ERROR = 0.010  # [m]
+MIN_CIRCLE_SHARE = 0.8
 Tables = Mapping[str, pd.DataFrame]
-DURATION: Final = 10.0  # [s] length of a move
-REPRODUCED: Final = "reproduced"
-NOT_REPRODUCED: Final = "not reproduced"
-DEPENDS: Final = "depends"
-UNDECIDED: Final = "too few robots to tell"
-PROPOSED: Final = "rbfnn_mfac"
-MPC: Final = "ukf_mpc"
-OTHERS: Final = ("rbf_pid", "ukf_mfac", MPC)
-MOVES: Final = ("exp1", "exp2", "exp3", "exp4")
+DURATION = 10.0  # [s] length of a move
+REPRODUCED = "reproduced"
+NOT_REPRODUCED = "not reproduced"
+DEPENDS = "depends"
+UNDECIDED = "too few robots to tell"
+PROPOSED = "rbfnn_mfac"
+MPC = "ukf_mpc"
+OTHERS = ("rbf_pid", "ukf_mfac", MPC)
+MOVES = ("exp1", "exp2", "exp3", "exp4")
 # Start or target lie outside the region in which networks are trained
-LEAVING: Final = ("exp1", "exp4")
-STAYING: Final = ("exp2", "exp3")
-CIRCLE: Final = "circle"
-DIVISIONS: Final[Mapping[str, str]] = {  # equipment of the methods -> suffix of their names
+LEAVING = ("exp1", "exp4")
+STAYING = ("exp2", "exp3")
+CIRCLE = "circle"
+DIVISIONS: Mapping[str, str] = {  # equipment of the methods -> suffix of their names
     "best equipped": "",
     "as published": PUBLISHED,
 }
-FIRST_SEED: Final = 30_000  # far from the seeds that methods are tuned on
-MAIN: Final = "main"
-FROZEN: Final = "frozen"  # the Jacobian network as it was trained
-NO_EPSILON: Final = "no_epsilon"  # the paper as printed: no ε in either step size
-ENTRIES: Final = "entries"  # the paper's fit of the entries of ψ
-TIMED: Final = "timed"  # few runs, each by itself: how long steps take
-TIMED_ROBOTS: Final = 5  # 20 moves and 5 circles a method
-READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
+FIRST_SEED = 30_000  # far from the seeds that methods are tuned on
+MAIN = "main"
+FROZEN = "frozen"  # the Jacobian network as it was trained
+NO_EPSILON = "no_epsilon"  # the paper as printed: no ε in either step size
+ENTRIES = "entries"  # the paper's fit of the entries of ψ
+TIMED = "timed"  # few runs, each by itself: how long steps take
+TIMED_ROBOTS = 5  # 20 moves and 5 circles a method
+READINGS: Mapping[str, Mapping[str, Any]] = {
     FROZEN: {"estimator": {"k2": 1e-9}},
     NO_EPSILON: {"law": {"epsilon": 0.0}, "estimator": {"epsilon": 0.0}},
     ENTRIES: {"training": {"controller": {"fit": "entries"}}},

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -27,13 +27,13 @@ from servobench.harness.config.registry import find_plant
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_text, write_atomically
 
-MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
-ANSWERS: Final = "answers.csv"
-MEASUREMENTS: Final = "measurements.csv"
-NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
+MIN_ROBOTS = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
+ANSWERS = "answers.csv"
+MEASUREMENTS = "measurements.csv"
+NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
 # Tolerances of the numbers in the evidence: a tenth, and a period
-RELATIVE: Final = 0.1  # [1]
-ABSOLUTE: Final = 0.051  # [s] for times
+RELATIVE = 0.1  # [1]
+ABSOLUTE = 0.051  # [s] for times
 # Claim, plant, division -> verdict, evidence
 Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]
 

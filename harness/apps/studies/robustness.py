@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -38,16 +38,16 @@ from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
-BASE: Final = "moderate"
-TASK: Final = "random"
-DURATION: Final = "task.duration"
-LONGER: Final[Varied] = ((DURATION, 20.0),)  # [s], settings of a run whose camera is moved half-way
-FIGURES: Final = "figures"
-LIMITS: Final = "predicted_limits.csv"
-NOTE: Final = 115  # letters on a line of the notes below the title
-MOVE: Final = "camera_move"
-LATENCY: Final = "latency"
-NOISE: Final = "noise"
+BASE = "moderate"
+TASK = "random"
+DURATION = "task.duration"
+LONGER: Varied = ((DURATION, 20.0),)  # [s], settings of a run whose camera is moved half-way
+FIGURES = "figures"
+LIMITS = "predicted_limits.csv"
+NOTE = 115  # letters on a line of the notes below the title
+MOVE = "camera_move"
+LATENCY = "latency"
+NOISE = "noise"
 Measure: TypeAlias = Callable[[pd.DataFrame], comparison.Estimate]  # of the runs at a place
 
 
@@ -76,8 +76,8 @@ def _read_lines() -> dict[str, Line]:
     return lines
 
 
-KNOWN_LINES: Final = _read_lines()
-LINES: Final = tuple(line for line in KNOWN_LINES.values() if line.usual)
+KNOWN_LINES = _read_lines()
+LINES = tuple(line for line in KNOWN_LINES.values() if line.usual)
 
 
 def find_lines(axes: Sequence[str]) -> tuple[Line, ...]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +20,8 @@ from numpy.typing import ArrayLike
 from servobench.harness.analysis.comparison import ALPHA, CONFIDENCE, RESAMPLES, Estimate, holm
 from servobench.plant.contract.checks import FloatArray
 
-TRIMMED: Final = 0.25  # share of the scores that an interquartile mean leaves out at each end
-SPLITS: Final = 200  # random halves of the robots from which the resolution is estimated
+TRIMMED = 0.25  # share of the scores that an interquartile mean leaves out at each end
+SPLITS = 200  # random halves of the robots from which the resolution is estimated
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ grade and no part in the ranking.
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -40,14 +39,14 @@ from servobench.harness.run.resolution import check_settings, resolve_sections, 
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.files import write_csv
 
-MAX_REFERENCE_LOSS: Final = 0.05
-SEEING: Final = "nmpc_calibrated"  # reference that sees the images of all methods
-RUNS: Final = "scores.csv"
-METHODS: Final = "methods.csv"
-RANKING: Final = "ranking.csv"
-PICTURE: Final = "suite"
-FACTORS: Final = (1.1, 2.0, 10.0)  # times the best method of a run, of the profile in the table
-DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())
+MAX_REFERENCE_LOSS = 0.05
+SEEING = "nmpc_calibrated"  # reference that sees the images of all methods
+RUNS = "scores.csv"
+METHODS = "methods.csv"
+RANKING = "ranking.csv"
+PICTURE = "suite"
+FACTORS = (1.1, 2.0, 10.0)  # times the best method of a run, of the profile in the table
+DRAWN_FACTORS = tuple(np.geomspace(1.0, 100.0, 81).tolist())
 
 
 def carry_out_suite(

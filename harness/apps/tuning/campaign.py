@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, final
 
 from servobench.harness.apps.tuning.objective import (
     LEDGER,
@@ -57,7 +57,7 @@ from servobench.plant.contract.files import accessing, write_atomically
 from servobench.plant.contract.settings import Count, Periods, settings
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
-TOLERANCE: Final = 0.03  # [1] share of the score by which no change may improve it
+TOLERANCE = 0.03  # [1] share of the score by which no change may improve it
 
 
 @settings

@@ -28,7 +28,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Self, TypeAlias, final
+from typing import Any, Self, TypeAlias, final
 
 import numpy as np
 
@@ -60,19 +60,19 @@ from servobench.plant.contract.settings import Count, Periods, settings
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
-MOVE: Final = "random"
+MOVE = "random"
 # Settings of the tasks, short because a settled run needs no more time
-TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
+TASKS: Mapping[str, Mapping[str, Any]] = {
     MOVE: {"duration": 6.0},
     "circle": {"radius": 0.17, "lap_time": 5.0},  # at 0.21 m/s, the whole task at 0.19 m/s
     "lemniscate": {"radius": 0.14, "lap_time": 5.0},
 }
 # Starts leave the networks' box by 0.5 rad each way.
-_LEAVING: Final[Varied] = (
+_LEAVING: Varied = (
     ("task.lower", tuple(low - 0.5 for low in TRAINING_LOWER)),
     ("task.upper", tuple(high + 0.5 for high in TRAINING_UPPER)),
 )
-KINDS: Final[tuple[tuple[str, Varied], ...]] = (
+KINDS: tuple[tuple[str, Varied], ...] = (
     (MOVE, ()),
     (MOVE, ()),
     (MOVE, _LEAVING),
@@ -83,7 +83,7 @@ KINDS: Final[tuple[tuple[str, Varied], ...]] = (
     ("lemniscate", (("period", 0.1),)),
 )
 """Task and varied settings of each world."""
-LEVELS: Final[Mapping[str, tuple[Any, ...]]] = {
+LEVELS: Mapping[str, tuple[Any, ...]] = {
     "latency": (0.0, 0.05, 0.1, 0.15),  # [s]
     "noise": (1.0, 4.0),  # factor
     "detector": (
@@ -99,7 +99,7 @@ LEVELS: Final[Mapping[str, tuple[Any, ...]]] = {
     "drive": ((), (), (), (), (), (), (("plant.command_delay", 0.0),), (("plant.overshoot", 0.3),)),
 }
 """One level of each is that of a world."""
-MODELS: Final = (
+MODELS = (
     "moderate",
     "moderate+camera_rotation=30deg",
     "moderate+camera_rotation=60deg",
@@ -118,16 +118,16 @@ def _weight(task: str) -> float:
     return len(KINDS) / 2 / alike
 
 
-WEIGHTS: Final[Mapping[str, float]] = {task: _weight(task) for task, _ in KINDS}
+WEIGHTS: Mapping[str, float] = {task: _weight(task) for task, _ in KINDS}
 # An error below the floor gains nothing; it is that of `log_error` where the settling band is 5 mm.
-FLOOR: Final = 0.0015  # [m]
-DECADES: Final = math.log10(1.0 / FLOOR)  # from the floor to 1 m
-WORST: Final = 1.0  # cost of a run that did not complete, and the greatest of any run
+FLOOR = 0.0015  # [m]
+DECADES = math.log10(1.0 / FLOOR)  # from the floor to 1 m
+WORST = 1.0  # cost of a run that did not complete, and the greatest of any run
 # Settings whose loop has a smaller delay margin at the usual latency are refused without a run.
-MIN_DELAY_MARGIN: Final = 0.05  # [s]
+MIN_DELAY_MARGIN = 0.05  # [s]
 # Where in the tuning range the seeds of the second sets begin
-SECOND_OFFSET: Final = len(TUNING) // 2
-SECOND_FACTOR: Final = 3  # robots of the second set for each of the first
+SECOND_OFFSET = len(TUNING) // 2
+SECOND_FACTOR = 3  # robots of the second set for each of the first
 
 
 @settings
@@ -293,11 +293,11 @@ def evaluate(
             yield t, r, run_cost(runs[r].task, result.row)
 
 
-SECOND: Final = ".second"  # in the name of the ledger of the second set
+SECOND = ".second"  # in the name of the ledger of the second set
 Wanted: TypeAlias = tuple["Ledger", str, Mapping[str, Any]]
 """A point whose costs are wanted: the ledger that takes them, the controller, its nested settings."""
-LEDGER: Final = ".jsonl"
-SHOWN: Final = 60  # letters of wrong costs that a message holds
+LEDGER = ".jsonl"
+SHOWN = 60  # letters of wrong costs that a message holds
 
 
 @final

@@ -28,7 +28,7 @@ import warnings
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from importlib.resources import files
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import optuna
@@ -50,13 +50,13 @@ Space: TypeAlias = Mapping[str, Distribution]
 Point: TypeAlias = Mapping[str, Any]
 """A value for each key of a space."""
 
-DIGITS: Final = 3  # significant digits of a tuned number; no study is more precise
-EDGE: Final = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
-WIDER: Final = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
-_TABLES: Final = tomllib.loads(
+DIGITS = 3  # significant digits of a tuned number; no study is more precise
+EDGE = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
+WIDER = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
+_TABLES = tomllib.loads(
     (files("servobench.harness.apps.tuning") / "spaces.toml").read_text(encoding="utf-8")
 )
-LIMITS: Final[Mapping[str, float]] = _TABLES["limits"]
+LIMITS: Mapping[str, float] = _TABLES["limits"]
 """Upper ends of boxes that are no choice; a lower end of 0, or of one step, is none either."""
 
 
@@ -97,7 +97,7 @@ def _box(given: Any) -> Distribution:  # noqa: ANN401 - a table or a list of TOM
     return FloatDistribution(**given)
 
 
-SPACES: Final[Mapping[str, Space]] = _spaces()
+SPACES: Mapping[str, Space] = _spaces()
 
 
 def choose_tunable(word: str) -> str:
@@ -244,9 +244,9 @@ def nested_settings(values: Point) -> dict[str, Any]:
     return nest(rounded)
 
 
-STEP: Final = 0.2  # [1] share of a number by which it is changed
-STEP_FROM_ZERO: Final = 0.05  # [1] share of the range's upper end by which a number of 0 is changed
-ACCEPTED: Final = 0.005  # [1] share of the score that a change must gain to be kept
+STEP = 0.2  # [1] share of a number by which it is changed
+STEP_FROM_ZERO = 0.05  # [1] share of the range's upper end by which a number of 0 is changed
+ACCEPTED = 0.005  # [1] share of the score that a change must gain to be kept
 
 
 class Found(NamedTuple):

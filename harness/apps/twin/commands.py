@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import ResolvedRun
 
-IDENTIFYING: Final = "constant"  # a controller, which identification does not run
-PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that is easier to write
+IDENTIFYING = "constant"  # a controller, which identification does not run
+PERIOD_TOLERANCE = 1e-4  # [1] within which a logged period is one that is easier to write
 LOG = typer.Argument(
     help="Results folder, or a table (.csv, .parquet) with the columns of its steps; none with --joints."
 )
-LEGEND: Final = (
+LEGEND = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
     "The log does not answer to the controller, so that this does not say how well it would have done."
 )
@@ -56,7 +56,7 @@ class StreamOptions:
     ] = None
 
 
-USUAL_STREAMS: Final = StreamOptions()
+USUAL_STREAMS = StreamOptions()
 
 
 def shadow(

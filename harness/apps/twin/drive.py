@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -11,29 +11,27 @@ from servobench.harness.apps.twin.identification import Log, correlation_time
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 
-MAX_LAG: Final = 0.5  # [s] longest delay and longest lag of joints behind commands
+MAX_LAG = 0.5  # [s] longest delay and longest lag of joints behind commands
 # The delays and lags from which a fit may start.
-MAX_FIRST_DELAY: Final = 0.2  # [s]
-DELAY_STEP: Final = 0.1  # [periods]
-FIRST_LAGS: Final = (0.01, 0.03, 0.1)  # [s]
+MAX_FIRST_DELAY = 0.2  # [s]
+DELAY_STEP = 0.1  # [periods]
+FIRST_LAGS = (0.01, 0.03, 0.1)  # [s]
 # Commands may be clipped at another level if the largest speeds of commands and joints differ by this factor.
-CLIPPED_RATIO: Final = 1.05  # [1]
+CLIPPED_RATIO = 1.05  # [1]
 # Commands may be mistaken if the drive leaves more than this share of the motion unexplained.
-SUSPECT_SHARE: Final = 0.1  # [1]
+SUSPECT_SHARE = 0.1  # [1]
 # A log tells no drive that leaves more than this share of the motion unexplained.
-MAX_UNEXPLAINED: Final = 0.5  # [1]
-SHIFTS: Final = (0.0, 0.1, 0.2, 0.3)  # [s] tried delays of joints behind their commands
-MIN_CORRELATION: Final = 0.7  # [1] correlation of a joint with a command that it follows
+MAX_UNEXPLAINED = 0.5  # [1]
+SHIFTS = (0.0, 0.1, 0.2, 0.3)  # [s] tried delays of joints behind their commands
+MIN_CORRELATION = 0.7  # [1] correlation of a joint with a command that it follows
 # A joint follows another one's command if its correlation with its own is below this share of that.
-MAX_OWN_SHARE: Final = 0.6  # [1]
-MIN_MOTION: Final = 0.05  # [rad] range of a joint that moves
+MAX_OWN_SHARE = 0.6  # [1]
+MIN_MOTION = 0.05  # [rad] range of a joint that moves
 # [1] Commands over joint speeds; in deg/s they are 57 times as large.
-MAX_SPEED_RATIO: Final = 20.0
-POSITION_TOLERANCE: Final = (
-    0.1  # [rad] Commands that are joint positions are no farther from these.
-)
+MAX_SPEED_RATIO = 20.0
+POSITION_TOLERANCE = 0.1  # [rad] Commands that are joint positions are no farther from these.
 # Another level of clipping has to leave less than this share of the squared errors.
-MIN_GAIN: Final = 0.5  # [1]
+MIN_GAIN = 0.5  # [1]
 
 
 class Response(NamedTuple):

@@ -1,6 +1,6 @@
 """The end of a log, held out: errors of the robot that is identified from the frames before."""
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from servobench.harness.apps.twin.identification import (
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
-SHARE: Final = 0.2  # [1] share of the last frames
-FITS: Final = 2  # as the search begins at the robot of the whole log
+SHARE = 0.2  # [1] share of the last frames
+FITS = 2  # as the search begins at the robot of the whole log
 
 
 class HeldOut(NamedTuple):

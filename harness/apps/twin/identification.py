@@ -16,7 +16,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -38,19 +38,19 @@ from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
 from servobench.plant.robot.parametric import ParametricModel
 from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
 
-LOG: Final = "the log"  # in error messages
-VELOCITY: Final = COMMAND.removesuffix("_command")  # as commands are misnamed
-CAPTURED: Final = "capture_time_s"  # column with the stamps of frames
-MAX_LATENESS_RANGE: Final = (
+LOG = "the log"  # in error messages
+VELOCITY = COMMAND.removesuffix("_command")  # as commands are misnamed
+CAPTURED = "capture_time_s"  # column with the stamps of frames
+MAX_LATENESS_RANGE = (
     2.0  # [s] between the latest and the earliest stamped frame, by the rows' clock
 )
-MAX_CLOCK_DRIFT: Final = 0.02  # [s/s] by which the clock of a camera may drift
-MAX_LATENCY: Final = 0.25  # [s]
-LATENCY_STEP: Final = 0.0125  # [s] between latencies of the first search
-MIN_FRAMES: Final = 50
-MAX_FRAMES: Final = 6000
+MAX_CLOCK_DRIFT = 0.02  # [s/s] by which the clock of a camera may drift
+MAX_LATENCY = 0.25  # [s]
+LATENCY_STEP = 0.0125  # [s] between latencies of the first search
+MIN_FRAMES = 50
+MAX_FRAMES = 6000
 # Prior standard deviation of each kind of parameter, which is the beginning of its name.
-PRIORS: Final = {
+PRIORS = {
     "latency": 0.1,  # [s]
     "camera_turn": 1.0,  # [rad]
     "camera": 1.0,  # [m]
@@ -68,43 +68,43 @@ PRIORS: Final = {
     "swing": 0.1,  # [s]
     "drift": 0.01,  # [s/s]
 }
-EXTRAS: Final = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compliance", "turning")
+EXTRAS = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compliance", "turning")
 """Parameters of gears, clocks, tool and mounting; pixels do not tell the last two."""
-TOLD_BY_PIXELS: Final = EXTRAS[:5]
-EXPOSURE: Final = ("latency", *TOLD_BY_PIXELS)  # parameters that decide which joints a frame shows
-ARM: Final = ("gear", "zero", "link", "tool")
+TOLD_BY_PIXELS = EXTRAS[:5]
+EXPOSURE = ("latency", *TOLD_BY_PIXELS)  # parameters that decide which joints a frame shows
+ARM = ("gear", "zero", "link", "tool")
 """How the names of the arm's own parameters begin."""
-MAX_OFF_TURN: Final = 1.0  # [rad] A joint is wrapped if it jumps by 2π to within this.
+MAX_OFF_TURN = 1.0  # [rad] A joint is wrapped if it jumps by 2π to within this.
 # A motion from row to row is a jump if it is faster than this many speed limits, and JUMP_STEP more.
-JUMP_SPEED: Final = 1.5  # [1]
-JUMP_STEP: Final = 0.05  # [rad]
+JUMP_SPEED = 1.5  # [1]
+JUMP_STEP = 0.05  # [rad]
 # A change of a feature is large if it exceeds its least change, such as one pixel, by this factor.
-LARGE_CHANGE_RATIO: Final = 2.5  # [1]
-MAX_REPEATED: Final = 0.01  # [1] share of frames that equal another one although the arm moves
-MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
-UNLIKELY: Final = 3.0  # [1] A parameter of the arm is unlikely beyond this many prior deviations.
-TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] tried in the first search
-SWING_PERIODS: Final = np.geomspace(1.0, 20.0, 120)  # [s] tried in the search
+LARGE_CHANGE_RATIO = 2.5  # [1]
+MAX_REPEATED = 0.01  # [1] share of frames that equal another one although the arm moves
+MIN_JOINT_STEP = 1e-4  # [rad] between two frames of an arm that moves
+UNLIKELY = 3.0  # [1] A parameter of the arm is unlikely beyond this many prior deviations.
+TURNINGS = np.radians(np.arange(0.0, 31.0))  # [rad/s] tried in the first search
+SWING_PERIODS = np.geomspace(1.0, 20.0, 120)  # [s] tried in the search
 # A swing is taken if it explains this many times the mean square of the frames; the best of noise explains 10 to 15.
-MIN_WAVE: Final = 25.0  # [1]
-MIN_SWINGS: Final = 3  # A log must be longer than this many periods of a swing.
-RIPPLE_ORDER: Final = MechanicsConfig().ripple_order
-ACCELERATION_SPAN: Final = 0.2  # [s] span of the rows from which an acceleration is taken
-MIN_CUBIC_ROWS: Final = 5
-MIN_PLAY: Final = 0.002  # [rad] play about which its effect is linearised
+MIN_WAVE = 25.0  # [1]
+MIN_SWINGS = 3  # A log must be longer than this many periods of a swing.
+RIPPLE_ORDER = MechanicsConfig().ripple_order
+ACCELERATION_SPAN = 0.2  # [s] span of the rows from which an acceleration is taken
+MIN_CUBIC_ROWS = 5
+MIN_PLAY = 0.002  # [rad] play about which its effect is linearised
 # The log tells a parameter if its deviation grows less than this with a prior of twice the width.
-MAX_PRIOR_EFFECT: Final = 1.2  # [1]
+MAX_PRIOR_EFFECT = 1.2  # [1]
 # The log tells a direction of θ if its posterior deviation is below this share of the prior one.
-MAX_PRIOR_SHARE: Final = 0.5  # [1]
-OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
-FITS: Final = 4
-ROBUST_TOLERANCE: Final = 1e-4  # [1] relative tolerance of the cost in robust fits
-LAST_TOLERANCE: Final = 1e-6  # [1] and in the last one
-MAX_EVALUATIONS: Final = 5  # evaluations of the residuals for each fit and parameter
-WEISZFELD_STEPS: Final = 5
-ROWS_AT_ONCE: Final = 2**14  # rows of logs for which cameras are placed side by side
-STEP: Final = 1e-6  # [1] step of finite differences, in prior deviations
-MAX_LAGS: Final = 100  # [frames] longest lag in the correlation time
+MAX_PRIOR_SHARE = 0.5  # [1]
+OUTLIER = 16.0  # [1] squared Mahalanobis distance of an outlier
+FITS = 4
+ROBUST_TOLERANCE = 1e-4  # [1] relative tolerance of the cost in robust fits
+LAST_TOLERANCE = 1e-6  # [1] and in the last one
+MAX_EVALUATIONS = 5  # evaluations of the residuals for each fit and parameter
+WEISZFELD_STEPS = 5
+ROWS_AT_ONCE = 2**14  # rows of logs for which cameras are placed side by side
+STEP = 1e-6  # [1] step of finite differences, in prior deviations
+MAX_LAGS = 100  # [frames] longest lag in the correlation time
 
 
 class Clocks(NamedTuple):

@@ -10,7 +10,7 @@ exposure to recording, relative to that of joints, and the offset is the latency
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,8 +39,8 @@ from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch
 
-MAX_OFFSET: Final = 1.0  # [s] between clocks, with the latency, within which it is sought
-ROUNDING: Final = 1e-3  # [rows] by which a frame may come after its row
+MAX_OFFSET = 1.0  # [s] between clocks, with the latency, within which it is sought
+ROUNDING = 1e-3  # [rows] by which a frame may come after its row
 
 
 class _Frames(NamedTuple):

@@ -1,7 +1,5 @@
 """Units and axes of a log: whether its joints, features and references can be those of a robot."""
 
-from typing import Final
-
 import numpy as np
 
 from servobench.controllers.algebra import nearest_rotation
@@ -13,16 +11,16 @@ from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.hand_eye import RobotModel
 
-MAX_EXCESS: Final = 0.1  # [rad] by which a joint may be beyond its range without a remark
-MAX_FEATURE: Final = 20.0  # [m] largest feature that a camera may see, in natural units
+MAX_EXCESS = 0.1  # [rad] by which a joint may be beyond its range without a remark
+MAX_FEATURE = 20.0  # [m] largest feature that a camera may see, in natural units
 # Noise may be larger than a motion whose RMS distance from the mean is below this.
-MIN_MOTION: Final = 0.02  # [m]
+MIN_MOTION = 0.02  # [m]
 # A mirrored motion can be told from a turned one if its second direction has this share of the first one's size.
-MIN_SECOND_DIRECTION: Final = 0.1  # [1]
+MIN_SECOND_DIRECTION = 0.1  # [1]
 # Share of the motion that the model may leave unexplained without a remark, by unit.
-MAX_UNEXPLAINED: Final = {"m": 0.2, "px": 0.35}
+MAX_UNEXPLAINED = {"m": 0.2, "px": 0.35}
 # Pixels have no usual size, so an affine map explains any small motion: the model's must not be larger by this factor.
-MAX_MOTION_RATIO: Final = 8.0  # [1]
+MAX_MOTION_RATIO = 8.0  # [1]
 
 
 def check_units(log: Log, reference: FloatArray, model: RobotModel | None) -> None:

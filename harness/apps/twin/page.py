@@ -5,7 +5,7 @@ It has the style and the tables of the report on a results folder, and loads not
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -36,18 +36,18 @@ from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.twin import deviated
 
-TEMPLATE: Final = "twin.html.j2"
-OWN: Final = Path(__file__).parent
-LONG_TABLE: Final = 100  # rows; of a table that has more, the page shows a line that opens it
-BINS: Final = 20  # parts of time and of each joint's range
-POSTURES: Final = 1500  # for which the page says how sure the twin is
-REGION: Final = 2.0  # [1] range of their joints over that of the log
-STEP: Final = 1e-4  # [1] part of a deviation, with which derivatives are taken
-PANEL: Final = 2.1  # [in] height of a panel
-MIN_IN_BIN: Final = 5  # frames
-AXIS_ROOM: Final = 4.5  # [1] half of the height of a panel over the deviation of residuals
-PLANES: Final = (("x", "y"), ("x", "z"))  # in the base frame
-DRAWN: Final[dict[str, Any]] = {"linestyle": "", "marker": ".", "markersize": 2.0}
+TEMPLATE = "twin.html.j2"
+OWN = Path(__file__).parent
+LONG_TABLE = 100  # rows; of a table that has more, the page shows a line that opens it
+BINS = 20  # parts of time and of each joint's range
+POSTURES = 1500  # for which the page says how sure the twin is
+REGION = 2.0  # [1] range of their joints over that of the log
+STEP = 1e-4  # [1] part of a deviation, with which derivatives are taken
+PANEL = 2.1  # [in] height of a panel
+MIN_IN_BIN = 5  # frames
+AXIS_ROOM = 4.5  # [1] half of the height of a panel over the deviation of residuals
+PLANES = (("x", "y"), ("x", "z"))  # in the base frame
+DRAWN: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0}
 
 
 class Region(NamedTuple):

@@ -7,8 +7,6 @@ The Jacobian Ĵ_k that the controller holds at a valid frame k, learned up to th
 with the logged joint positions q and the delay d_k of the camera that the controller has identified, 0 without one.
 """
 
-from typing import Final
-
 import numpy as np
 import pandas as pd
 
@@ -16,12 +14,12 @@ from servobench.harness.run.log import Steps
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import remark
 
-PREDICTED: Final = "predicted_"  # before the name of a column of features
-DELAY: Final = "delay"  # diagnostic of controllers that identify the camera's delay [s]
-MAX_DELAY: Final = 0.25  # [s] longest delay that is tried in place of the controller's
+PREDICTED = "predicted_"  # before the name of a column of features
+DELAY = "delay"  # diagnostic of controllers that identify the camera's delay [s]
+MAX_DELAY = 0.25  # [s] longest delay that is tried in place of the controller's
 # Another delay is remarked on if it leaves less than this share of the prediction error.
-MIN_GAIN: Final = 0.8  # [1]
-MAX_LATE: Final = 12  # control periods by which a frame may follow another, or be late
+MIN_GAIN = 0.8  # [1]
+MAX_LATE = 12  # control periods by which a frame may follow another, or be late
 
 
 def predicted(steps: Steps, delay: float | None = None) -> FloatArray:

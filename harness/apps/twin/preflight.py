@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from heapq import nsmallest
 from itertools import combinations, count, groupby, islice
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,30 +27,28 @@ from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.hand_eye import RobotModel
 
 # Features in m that move farther than the nominal robot's by this factor are in another unit.
-MAX_MOTION_RATIO: Final = 20.0  # [1]
-UNITS: Final = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
+MAX_MOTION_RATIO = 20.0  # [1]
+UNITS = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
 # Something is wrong if residuals exceed the noise from frame to frame by this factor.
-MAX_NOISE_RATIO: Final = 1.5  # [1]
+MAX_NOISE_RATIO = 1.5  # [1]
 # Errors that nothing explains are refused from this share of the motion of features on.
-REFUSED_SHARE: Final = 0.1  # [1]
+REFUSED_SHARE = 0.1  # [1]
 # Residuals below this share of the motion of features are small in any case.
-MIN_SHARE: Final = 0.01  # [1]
+MIN_SHARE = 0.01  # [1]
 # One remedy explains a log if it leaves less than this share of the misfit, two if they leave less of that of one.
-REMEDY_GAIN: Final = 0.8  # [1]
-PAIR_GAIN: Final = 0.5  # [1]
+REMEDY_GAIN = 0.8  # [1]
+PAIR_GAIN = 0.5  # [1]
 # A log cannot tell mistakes apart whose remedies leave at most this many times the least misfit.
-TIE_RATIO: Final = 1.1  # [1]
+TIE_RATIO = 1.1  # [1]
 # The robot of a search is taken if it leaves less than this share of the squared residuals.
-SEARCH_GAIN: Final = 0.8  # [1]
-SCREENED: Final = 6  # number of remedies that are fitted, those with the least errors
-REMEDIES_AT_ONCE: Final = 64  # remedies for which cameras are placed side by side
-FRAMES: Final = 150  # frames for fits of remedies
-MIN_DRIFT: Final = (
-    10.0  # [ms] between clocks, at once or over the log, from which they count as apart
-)
-CERTAIN: Final = 6.0  # [1] standard deviations from none that leave no doubt
-PARTS: Final = 16  # parts of the log, between which the camera may have moved
-JUMP_RATIO: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
+SEARCH_GAIN = 0.8  # [1]
+SCREENED = 6  # number of remedies that are fitted, those with the least errors
+REMEDIES_AT_ONCE = 64  # remedies for which cameras are placed side by side
+FRAMES = 150  # frames for fits of remedies
+MIN_DRIFT = 10.0  # [ms] between clocks, at once or over the log, from which they count as apart
+CERTAIN = 6.0  # [1] standard deviations from none that leave no doubt
+PARTS = 16  # parts of the log, between which the camera may have moved
+JUMP_RATIO = 4.0  # [1] growth of the error between two parts when a camera is moved
 
 Others = Callable[[], Mapping[str, RobotModel]]
 

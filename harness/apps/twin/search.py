@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -31,11 +29,11 @@ from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.parametric import ParametricModel
 from servobench.plant.robot.twin import deviated
 
-SCREENED_AT_ONCE: Final = 256  # arms that are compared before any iteration
-KEPT: Final = 16  # the best of them, which are fitted
-COARSE: Final = 1e-2  # [m] deviation of residuals in this comparison, in natural units
-ITERATIONS: Final = 40  # which each fit makes
-RETURNED: Final = 4  # arms, as several may leave nearly equal residuals
+SCREENED_AT_ONCE = 256  # arms that are compared before any iteration
+KEPT = 16  # the best of them, which are fitted
+COARSE = 1e-2  # [m] deviation of residuals in this comparison, in natural units
+ITERATIONS = 40  # which each fit makes
+RETURNED = 4  # arms, as several may leave nearly equal residuals
 
 
 def searched(log: Log, model: RobotModel) -> list[dict[str, float]]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,27 +18,25 @@ from servobench.harness.apps.twin.identification import (
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 
-CERTAIN: Final = (
+CERTAIN = (
     5.0  # [1] deviations from none that make backlash, ripple, a soft tool and the like certain
 )
-MIN_JITTER: Final = 0.02  # [s] by which frames must be late by changing times
-WAVE_RESIDUAL_SHARE: Final = (
+MIN_JITTER = 0.02  # [s] by which frames must be late by changing times
+WAVE_RESIDUAL_SHARE = (
     0.3  # [1] share of the squares of stamped latenesses that a wave leaves where they swing
 )
-MAX_JITTER: Final = 0.05  # [s] deviation of these times that makes no outliers
-SLOW_SHARE: Final = (
-    0.3  # [1] share of the frames, the slowest ones, in which their lateness hardly shows
-)
+MAX_JITTER = 0.05  # [s] deviation of these times that makes no outliers
+SLOW_SHARE = 0.3  # [1] share of the frames, the slowest ones, in which their lateness hardly shows
 # Fast frames are late, and not false, if the median of their squared errors over the mean is above this.
-LATE_RATIO: Final = 0.2  # [1]
-BURST_RATIO: Final = 2.0  # [1] lost frames in a row over those of independent losses
+LATE_RATIO = 0.2  # [1]
+BURST_RATIO = 2.0  # [1] lost frames in a row over those of independent losses
 # Gaps of another length belong to the camera's period if they have this share of the usual ones.
-MIN_ODD_SHARE: Final = 0.05  # [1]
+MIN_ODD_SHARE = 0.05  # [1]
 # Between this many odd gaps of a steady camera the lateness of frames changes by less than MAX_UNEVENNESS.
-ODD_GAPS: Final = 12.0
-MAX_UNEVENNESS: Final = 2.0  # [rows]
-MIN_ROW_PART: Final = 1e-3  # [rows] from which the distance of frames is no whole number of rows
-JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s] that are tried
+ODD_GAPS = 12.0
+MAX_UNEVENNESS = 2.0  # [rows]
+MIN_ROW_PART = 1e-3  # [rows] from which the distance of frames is no whole number of rows
+JITTERS = np.arange(0.01, 0.5, 0.01).tolist()  # [s] that are tried
 
 
 def frame_period(log: Log) -> float:

@@ -4,8 +4,6 @@ The loop is open. Joint positions and features are those of the log, independent
 predicts a run under these commands; only the answers to the same observations are compared.
 """
 
-from typing import Final
-
 import numpy as np
 import pandas as pd
 
@@ -22,7 +20,7 @@ from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND, column_names
 
-LOGGED: Final = "logged_"  # before the name of a column of commands in the log
+LOGGED = "logged_"  # before the name of a column of commands in the log
 
 
 def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,13 +22,13 @@ from servobench.plant.contract.files import TIME, numbers_of, read_table, read_t
 from servobench.plant.contract.settings import Number, nested, override, settings, suggest
 from servobench.plant.contract.signals import COMMAND, PlantSpec, column_names
 
-RECEIVED: Final = "received"  # column with the times of recording
-STAMP: Final = "header.stamp"
-NANOSECOND: Final = 1e-9  # [s]
-MAX_PARTS: Final = 64  # entries of a list in a message that may be values; images have more
+RECEIVED = "received"  # column with the times of recording
+STAMP = "header.stamp"
+NANOSECOND = 1e-9  # [s]
+MAX_PARTS = 64  # entries of a list in a message that may be values; images have more
 # [s] Usual distance of stamps above which they are likely in another unit.
-MAX_STEP: Final = 5.0
-FAULTS: Final = (struct.error, TypeError, KeyError, EOFError, RuntimeError, OSError)
+MAX_STEP = 5.0
+FAULTS = (struct.error, TypeError, KeyError, EOFError, RuntimeError, OSError)
 """Errors of rosbags about a damaged bag, beside its own."""
 
 
@@ -64,10 +64,10 @@ class LogMap:
     """References, in the file of features; `shadow` alone needs them."""
 
 
-PLACE: Final = ("point.x", "point.y", "point.z")
-SPEEDS: Final = tuple(f"data.{i}" for i in range(MAX_PARTS))
-COMMAND_TOPIC: Final = "/forward_velocity_controller/commands"
-USUAL: Final = {  # stream -> its kind of columns in a table of steps, its topic, and fields of its messages
+PLACE = ("point.x", "point.y", "point.z")
+SPEEDS = tuple(f"data.{i}" for i in range(MAX_PARTS))
+COMMAND_TOPIC = "/forward_velocity_controller/commands"
+USUAL = {  # stream -> its kind of columns in a table of steps, its topic, and fields of its messages
     "joints": ("joint_position", "/joint_states", ()),
     "features": ("feature", "/feature", PLACE),
     "commands": (COMMAND, COMMAND_TOPIC, SPEEDS),

@@ -1,7 +1,7 @@
 """Identified robots in words: a table of estimates, and remarks on the log that they come from."""
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,14 +21,14 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.twin import TIMES
 
-MIN_TIMES: Final = 1e-3  # [s] No drive has a smaller sum of delay and lag.
-MIN_DEVIATION: Final = 1e-4  # [s] least deviation of delay and lag that is printed
+MIN_TIMES = 1e-3  # [s] No drive has a smaller sum of delay and lag.
+MIN_DEVIATION = 1e-4  # [s] least deviation of delay and lag that is printed
 # A parameter is named in a direction if its entry has this share of the largest one.
-MIN_ENTRY: Final = 0.05  # [1]
+MIN_ENTRY = 0.05  # [1]
 # Residuals count as white up to this many deviations of a correlation from none.
-MAX_CORRELATION: Final = 3.0  # [1]
+MAX_CORRELATION = 3.0  # [1]
 # Printed unit of each kind of parameter, and how many of these are one of its own unit.
-UNITS: Final = {
+UNITS = {
     "latency": ("ms", 1e3),
     "camera_turn": ("°", 180.0 / math.pi),
     "camera": ("mm", 1e3),
