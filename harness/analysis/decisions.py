@@ -41,7 +41,7 @@ Pair = tuple[str, str]
 class Question:
     """What a batch is to decide."""
 
-    pairs: tuple[Pair, ...]  # of controllers
+    pairs: tuple[Pair, ...]  # two controllers each
     worlds: int  # number of worlds in which each is compared
     seeds: tuple[int, ...]  # the budget, ascending
 

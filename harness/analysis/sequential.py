@@ -35,7 +35,7 @@ class Decision:
     verdict: Verdict
     robots: int  # those that were looked at
     told_by_lost: bool  # whether the lost runs decide, not the mean
-    mean: float  # of first − second over robots that neither loses [margins], each clipped at `CLIP`; NaN of none
+    mean: float  # first − second, over robots that neither loses [margins], each clipped at `CLIP`; NaN of none
     lost: tuple[int, int]  # number of lost runs of the first and of the second
 
 

@@ -232,9 +232,9 @@ def refuse_links(folder: Path) -> None:
                 if entry.is_dir(follow_symlinks=False):
                     waiting.append(entry.path)
                 elif not entry.is_file(follow_symlinks=False):
-                    found = f"{entry.path} is {'a link' if entry.is_symlink() else 'no file'}"
                     raise ConfigurationError(
-                        f"{found}, and a results folder holds files only; put a copy in its place"
+                        f"{entry.path} is {'a link' if entry.is_symlink() else 'no file'}, and a results "
+                        "folder holds files only; put a copy in its place"
                     )
 
 

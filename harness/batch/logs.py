@@ -171,8 +171,10 @@ def _period(path: Path, table: pd.DataFrame) -> float:
             for unit, count in PER_SECOND.items()
             if 1e-3 <= usual / count < 1.0
         ]
-        needed = f"it needs two or more, and time_s in s, not in {next(iter(units), 'ms')}"
-        raise ConfigurationError(f"log {path} has {len(times)} rows, {usual:g} s apart; {needed}")
+        raise ConfigurationError(
+            f"log {path} has {len(times)} rows, {usual:g} s apart; it needs two or more, and time_s in s, not in "
+            f"{next(iter(units), 'ms')}"
+        )
     if not USUAL_PERIODS[0] < usual < USUAL_PERIODS[1]:
         remark(
             f"rows of {path.name} are {usual:.3g} s apart: time_s is in s, no count of rows or minutes"
@@ -208,5 +210,6 @@ def _fitted_period(path: Path, times: FloatArray, tolerance: float) -> float:
         periods = round(steps[row - 1] / usual)
         found = f"which is {periods} control periods of {usual:.4g} s, so that rows are lost"
         remedy = "add them with feature_valid = 0 and joints in between, or resample the log at equal steps"
-    before = f"row {row} is {steps[max(row, 1) - 1]:.4g} s after the row before"
-    raise UnevenRows(f"log {path}: {before}, {found}: {remedy}")
+    raise UnevenRows(
+        f"log {path}: row {row} is {steps[max(row, 1) - 1]:.4g} s after the row before, {found}: {remedy}"
+    )

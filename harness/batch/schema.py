@@ -60,8 +60,11 @@ def read_manifest(folder: Path) -> Manifest:
         wanted = " of ".join(WORDS[each] for each in types)
         for key in manifest.keys() & keys:
             if not _has_type(manifest[key], *types):
-                came = f"{key} must be {wanted}, got {str(manifest[key])[:SHOWN]!r}"
-                raise DamagedFile(folder, MANIFEST, f"is damaged: {came}")
+                raise DamagedFile(
+                    folder,
+                    MANIFEST,
+                    f"is damaged: {key} must be {wanted}, got {str(manifest[key])[:SHOWN]!r}",
+                )
     return dict(manifest)
 
 

@@ -37,8 +37,10 @@ class DamagedFile(ConfigurationError):
     def __init__(self, folder: Path, name: str, fault: str) -> None:
         """Name the file, its fault and the remedy."""
         self.fault = fault
-        remedy = f"repeat the command that made the folder with --resume, or type: servobench verify {folder}"
-        super().__init__(f"{folder / name} {fault}; {remedy}")
+        super().__init__(
+            f"{folder / name} {fault}; repeat the command that made the folder with --resume, or type: servobench "
+            f"verify {folder}"
+        )
 
 
 class UnwritableFolder(OSError):
@@ -247,8 +249,9 @@ def reading(folder: Path, name: str) -> Iterator[None]:
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         why = " ".join(str(error).split()) or type(error).__name__
         if NO_THREAD in why:
-            limit = "no more threads or processes may be started here: ulimit -u"
-            raise ConfigurationError(f"{folder / name} cannot be read, as {limit}") from error
+            raise ConfigurationError(
+                f"{folder / name} cannot be read, as no more threads or processes may be started here: ulimit -u"
+            ) from error
         raise DamagedFile(folder, name, f"cannot be read ({why[:160].rstrip('.')})") from error
 
 

@@ -161,8 +161,10 @@ def _check_spec(made: Plant | World) -> None:
     spec, name = getattr(made, "spec", None), type(made).__name__
     if not isinstance(spec, PlantSpec):
         came = "nothing" if spec is None else type(spec).__name__
-        wanted = f"{name}.__init__ must set self.spec to a servobench.PlantSpec"
-        raise ConfigurationError(f"{wanted}, got {came}; PlantSpec.of_joints(...) makes one")
+        raise ConfigurationError(
+            f"{name}.__init__ must set self.spec to a servobench.PlantSpec, got {came}; PlantSpec.of_joints(...) "
+            "makes one"
+        )
 
 
 class Named(Protocol):

@@ -163,8 +163,10 @@ class FmuController(Controller):
         came = total_size(found["reference"])
         rows, rest = divmod(came, m)
         if rest or rows > 1 + preview:
-            wanted = f"{file}: reference must name {m} numbers a row for at most {1 + preview} rows"
-            raise ValueError(f"{wanted}, got {came}; run.preview_time says how far it reaches")
+            raise ValueError(
+                f"{file}: reference must name {m} numbers a row for at most {1 + preview} rows, got {came}; "
+                "run.preview_time says how far it reaches"
+            )
         return rows
 
     def reset(self, observation: Observation, seed: int) -> None:
@@ -275,8 +277,10 @@ def _conventional(path: Path) -> ControllerMapping:
         CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names
     ]
     if lacking:
-        lack = f"{path.name} has no {', '.join(lacking)}, as exported controllers have"
-        raise ValueError(f"{lack}; write a mapping of its names, such as {path.stem}.toml")
+        raise ValueError(
+            f"{path.name} has no {', '.join(lacking)}, as exported controllers have; write a mapping of its "
+            f"names, such as {path.stem}.toml"
+        )
     return ControllerMapping(path, **names)
 
 

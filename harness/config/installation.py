@@ -203,8 +203,9 @@ def _git(root: Path, *words: str) -> str:
     except subprocess.CalledProcessError as error:
         said = str(error.stderr).strip().partition("\n")[0].removeprefix("fatal: ")
         if "dubious ownership" in said:
-            remedy = f"git config --global --add safe.directory {root}"
-            raise CommitUnknown(f"the checkout belongs to another user; {remedy}") from error
+            raise CommitUnknown(
+                f"the checkout belongs to another user; git config --global --add safe.directory {root}"
+            ) from error
         raise CommitUnknown(f"git says: {said}") from error
     except subprocess.TimeoutExpired as error:
         raise CommitUnknown(f"git took longer than {GIT_TIME:g} s") from error

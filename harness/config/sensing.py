@@ -62,8 +62,9 @@ def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
     }
     found = {key: value for key, value in setups.items() if value not in SETUPS.values()}
     if not found:
-        wanted = "no object of servobench.plant.cameras.setups.SensingSetup"
-        raise ConfigurationError(f"{file} defines no sensing set-up: {wanted}")
+        raise ConfigurationError(
+            f"{file} defines no sensing set-up: no object of servobench.plant.cameras.setups.SensingSetup"
+        )
     first, *others = found
     if name in found or (name is None and not others):
         return found[name or first]

@@ -114,9 +114,10 @@ class SourceFile:
                 continue
             taken, beside = _origin(name), beside.resolve()
             if taken is not None and taken != beside:
-                found = f"{show(file)}:{line}: import {name} would take {show(taken)} instead of {show(beside)}"
-                remedy = "as a process has one module of a name; give one of them another name"
-                raise ConfigurationError(f"{found}, {remedy}")
+                raise ConfigurationError(
+                    f"{show(file)}:{line}: import {name} would take {show(taken)} instead of {show(beside)}, as a "
+                    "process has one module of a name; give one of them another name"
+                )
 
 
 def _origin(name: str) -> Path | None:

@@ -434,14 +434,14 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         single = ServoEnv(**choice)
         self._resolved = single.resolved
         if max_episode_steps not in (None, single.periods):
-            wanted = f"max_episode_steps must be {single.periods}, as the task has so many periods"
             raise ConfigurationError(
-                f"{wanted}, got {max_episode_steps}; settings= may change its duration"
+                f"max_episode_steps must be {single.periods}, as the task has so many periods, got "
+                f"{max_episode_steps}; settings= may change its duration"
             )
         if side_by_side_key(self._resolved) is None:
-            alone = f"plant {self._resolved.request.plant} carries out one run at a time"
             raise ConfigurationError(
-                f"{alone}: gymnasium.make_vec(..., vectorization_mode='async')"
+                f"plant {self._resolved.request.plant} carries out one run at a time: gymnasium.make_vec(..., "
+                "vectorization_mode='async')"
             )
         self.num_envs = int(num_envs)
         self.single_observation_space, self.single_action_space = (

@@ -65,8 +65,9 @@ def record_step(entry: ControllerEntry, controller: Controller) -> tuple[Recorde
     if servo.calibration is not None:
         raise NoForm(" while it fits the arm (aids.model=arm): take aids.model=regression")
     if not servo.initial.immediate:
-        remedy = "set initial.source to nominal or given"
-        raise NoForm(f" while it probes its initial Jacobian: {remedy}")
+        raise NoForm(
+            " while it probes its initial Jacobian: set initial.source to nominal or given"
+        )
     spec = servo.knowledge.spec
     groups = controller_groups(spec.n, spec.m, 1 + servo.knowledge.preview, spec.feature_unit)
     shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}

@@ -71,8 +71,11 @@ class HeldController(Controller):
         if _bytes(*given) != _bytes(observation, reference):
             raise WrongAnswer("step changes its arguments; work on a copy", method)
         if not isinstance(command, Command):
-            text = f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)`"
-            raise WrongAnswer(f"{text} with {n} joint velocities in rad/s", method)
+            raise WrongAnswer(
+                f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)` with "
+                f"{n} joint velocities in rad/s",
+                method,
+            )
         shape = command.joint_velocity.shape
         if shape != (n,):
             raise WrongAnswer(
@@ -173,9 +176,10 @@ class HeldPlant(Plant):
         observation = _call(method, signature, argument)
         name, _, _ = signature.partition("(")
         if not isinstance(observation, Observation):
-            text = f"{name} of the plant must return an Observation, got {_kind(observation)}"
             raise WrongAnswer(
-                f"{text}; write `return Observation(time, joint_position, feature)`", method
+                f"{name} of the plant must return an Observation, got {_kind(observation)}; write `return "
+                "Observation(time, joint_position, feature)`",
+                method,
             )
         for what, size in (("joint_position", self.spec.n), ("feature", self.spec.m)):
             shape = getattr(observation, what).shape

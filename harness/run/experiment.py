@@ -166,8 +166,9 @@ def _assemble(
         plant = entry.build(resolved.plant, setup)
     if not math.isclose(plant.spec.period, run.period):
         plant.close()
-        wanted = f"spec.period must be that of its setup, {run.period:g} s"
-        raise ConfigurationError(f"plant {request.plant}: {wanted}")
+        raise ConfigurationError(
+            f"plant {request.plant}: spec.period must be that of its setup, {run.period:g} s"
+        )
     try:
         if true is not None and request.mismatch.size("camera_move") > 0.0:
             # Refused where it cannot be moved; a user's camera may lack something before its reset.

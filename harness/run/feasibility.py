@@ -51,9 +51,9 @@ def check_possible(run: ResolvedRun, drawn: Drawn, spec: PlantSpec) -> None:
         limited = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
         for joint, value, lower, upper in limited:
             if not lower <= value <= upper:
-                wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
                 raise ConfigurationError(
-                    f"task {run.request.task}: {what} must be {wanted}, got {value:g}"
+                    f"task {run.request.task}: {what} must be within the joints' limits, {lower:.4g} to "
+                    f"{upper:.4g} rad for {joint}, got {value:g}"
                 )
     _check_reach(run, scenario, spec)
 
@@ -83,8 +83,9 @@ def check_features(run: ResolvedRun, drawn: Drawn, spec: PlantSpec, desired: Flo
     J = true.jacobian(start)
     fastest = float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)
     if speed > fastest:
-        arm = f"the arm at {fastest:.3g} {unit}/s at most from its start"
-        remark(f"{task} moves at {speed:.3g} {unit}/s, and {arm}")
+        remark(
+            f"{task} moves at {speed:.3g} {unit}/s, and the arm at {fastest:.3g} {unit}/s at most from its start"
+        )
     if sensing_file(request.sensing) is None:
         return
     sensing = f"sensing {request.sensing}"
@@ -115,16 +116,18 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     from_shoulder = np.linalg.norm(in_base - robot.workspace.shoulder, axis=-1)
     nearest = float(from_shoulder.min())
     if nearest < 0.5 * robot.workspace.reach[0]:
-        place = f"{1e3 * nearest:.0f} mm from the arm's shoulder"
-        remark(f"task {task}: a target {place} is within the arm itself")
+        remark(
+            f"task {task}: a target {1e3 * nearest:.0f} mm from the arm's shoulder is within the arm itself"
+        )
     worst = int(beyond.argmax())
     if beyond[worst] > 0.0:
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
         on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]
         what = "its target" if len(points) == 1 else "a point of its curve,"
-        found = f"{what} ({where}) m in the camera frame, is {distances[worst]:.2g} m out of the arm's reach"
-        remedy = f"for a target out of reach on purpose there is the task {', '.join(on_purpose)}"
-        raise ConfigurationError(f"task {task}: {found}; {remedy}")
+        raise ConfigurationError(
+            f"task {task}: {what} ({where}) m in the camera frame, is {distances[worst]:.2g} m out of the arm's "
+            f"reach; for a target out of reach on purpose there is the task {', '.join(on_purpose)}"
+        )
 
 
 @lru_cache(maxsize=64)

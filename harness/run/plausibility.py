@@ -36,8 +36,9 @@ def check_times(run: RunSettings, plant: str, config: object, duration: float) -
             times[f"{plant}.sensing.{name}"] = getattr(sensing, name)
         late = [begin for begin, _ in sensing.occlusion_windows if begin >= duration]
         if late:
-            where = f"{plant}.sensing.occlusion_windows"
-            raise ConfigurationError(f"{where} must begin within {whole}, got {late[0]:g} s")
+            raise ConfigurationError(
+                f"{plant}.sensing.occlusion_windows must begin within {whole}, got {late[0]:g} s"
+            )
     for name, time in times.items():
         if isinstance(time, float) and time > 0.0 and time >= duration:
             meant = likely_meant(time, "s", lambda other: other < duration)
@@ -77,8 +78,7 @@ def check_extents(plant: str, config: object, nominal: RobotModel | None) -> Non
         size = nominal.noise_unit * metres
         if size <= (whole if name == "outlier_size" else MAX_EXTENT * whole):
             continue
-        place = f"{plant}.sensing.{name}"
-        words = f"{place} is {size:.4g} {unit}, above a tenth of {whole:g} {unit}"
+        words = f"{plant}.sensing.{name} is {size:.4g} {unit}, above a tenth of {whole:g} {unit}"
         given = getattr(sensing, name)
         plain = given == metres
         if plain and unit == "px":

@@ -58,9 +58,9 @@ class Reference(ABC):
         finite = np.isfinite(rows).all(axis=-1)
         if not finite.all():
             first = int(finite.argmin())
-            wanted = "the reference of the task must be finite over the run and beyond it, as far as it is previewed"
             raise ConfigurationError(
-                f"{wanted}; got {rows[first].tolist()} at {first * period:g} s"
+                "the reference of the task must be finite over the run and beyond it, as far as it is "
+                f"previewed; got {rows[first].tolist()} at {first * period:g} s"
             )
         rows.flags.writeable = False
         return rows
@@ -91,8 +91,9 @@ class Waypoints(Reference):
             or self.times.shape != (len(self.points),)
             or len(self.points) == 0
         ):
-            came = f"{self.times.shape}, {self.points.shape}"
-            raise ValueError(f"waypoints need times (p,) and points (p, m), got {came}")
+            raise ValueError(
+                f"waypoints need times (p,) and points (p, m), got {self.times.shape}, {self.points.shape}"
+            )
         if not (np.diff(self.times) > 0.0).all() or self.times[0] < 0.0:
             raise ValueError("waypoint times must ascend, the first one from 0 s on")
 

@@ -126,9 +126,10 @@ class RunRequest:
         for role in ROLES:
             if key.startswith(f"{getattr(self, role)}."):
                 return f"{role}{key.removeprefix(getattr(self, role))}"
-        runs = f"runs of {self.controller} on {self.plant}, task {self.task}"
-        wanted = f"SECTION.KEY with one of the sections run, {', '.join(ROLES)}, such as plant.sensing.latency"
-        raise ConfigurationError(f"the setting {key} cannot be varied in {runs}: wanted {wanted}")
+        raise ConfigurationError(
+            f"the setting {key} cannot be varied in runs of {self.controller} on {self.plant}, task {self.task}: "
+            f"wanted SECTION.KEY with one of the sections run, {', '.join(ROLES)}, such as plant.sensing.latency"
+        )
 
     def varied_in(self, role: str) -> Varied:
         """Return the varied settings of a section, `run` or one of `ROLES`, by dotted key within it."""
@@ -150,8 +151,7 @@ class RunRequest:
             robot = f"{short_name(self.robot).replace(WITH, '+')}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{Path(self.sensing).name}-"
         varied = "".join(map(words_in_name, self.varied))
-        method = f"{robot}{sensing}{self.controller}"
-        name = f"{self.plant}-{method}-{self.task}-{self.mismatch}{varied}-{self.seed}"
+        name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}-{self.seed}"
         return UNFIT_FOR_FILES.sub("_", name)
 
     def as_row(self) -> dict[str, Any]:

@@ -170,8 +170,10 @@ def _probe(defaults: dict[str, Any], plants: list[str], controllers: list[str]) 
             name, defaults[name], {"initial": {"source": "probe"}, "aids": {"posture": False}}
         )
     if controllers:
-        how = f"{listed(controllers)}: initial.source=probe and aids.posture=false"
-        remark(f"{listed(plants)} has no model, so the mismatch is none, and for {how}")
+        remark(
+            f"{listed(plants)} has no model, so the mismatch is none, and for {listed(controllers)}: "
+            "initial.source=probe and aids.posture=false"
+        )
 
 
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass
@@ -203,9 +205,9 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     of_sensor = request.mismatch.plant_settings
     mechanical = [key for key in of_sensor if key.startswith("mechanics.")]
     if mechanical and "mechanics" not in {field.name for field in fields(sections[request.plant])}:
-        known = "gears and tools are those of kinematic and fmu"
         raise ConfigurationError(
-            f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}"
+            f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: gears and tools are "
+            "those of kinematic and fmu"
         )
     plant = request.varied_in("plant")
     of_profile = _of_profile(request, sections)
@@ -220,9 +222,9 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
             f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too"
         )
     if both := sorted(of_sensor.keys() & sections.given.get(request.plant, frozenset())):
-        word = f"{request.plant}.{both[0]} is set"
         raise ConfigurationError(
-            f"{word}, and the mismatch {request.mismatch} sets it, too; leave one out"
+            f"{request.plant}.{both[0]} is set, and the mismatch {request.mismatch} sets it, too; leave one "
+            "out"
         )
     return ResolvedRun(
         request,
@@ -295,9 +297,10 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
             raise ConfigurationError(f"unknown section {section!r}: {hint}")
     for section, _, text in settings.assigned:
         if section not in names:
-            found = f"--set {text}: {section!r} does not run here, so this has no effect"
-            remedy = "settings of other runs may stand in a file (--config)"
-            raise ConfigurationError(f"{found}; sections that run: {listed(names)}; {remedy}")
+            raise ConfigurationError(
+                f"--set {text}: {section!r} does not run here, so this has no effect; sections that run: "
+                f"{listed(names)}; settings of other runs may stand in a file (--config)"
+            )
     for section in settings.sections:
         if section not in names and (default := _default(section)) is not None:
             settings.resolve(section, default)

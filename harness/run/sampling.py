@@ -99,8 +99,10 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
     task = resolved.task
     if setting.model is None and not task.any_robot:
         others = ", ".join(name for name, entry in TASKS.items() if entry.default.any_robot)
-        why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
-        raise ConfigurationError(f"task {name}: {why}")
+        raise ConfigurationError(
+            f"task {name}: it is taught on a known robot, and this plant brings a robot of its own; use one of "
+            f"{others}"
+        )
     with configuration_errors(f"task {name}: "):
         with same_folder():
             scenario: object = task.scenario(setting)  # That of a user's task may be anything.
@@ -112,9 +114,10 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         last = (resolved.run.periods(scenario.duration) - 1) * resolved.run.period
         # A move is judged by its settling, whenever its judged part begins.
         if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:
-            begins = f"begins at {scenario.evaluate_from:g} s"
-            part = f"{begins}, after the last control instant at {last:g} s"
-            raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
+            raise ConfigurationError(
+                f"its judged part begins at {scenario.evaluate_from:g} s, after the last control instant at "
+                f"{last:g} s; let evaluate_from be earlier"
+            )
         if name not in TASKS:
             with configuration_errors(
                 "its scenario differs from one call to the next: ", Exception
@@ -130,9 +133,9 @@ def _points_of(scenario: Scenario, m: int) -> FloatArray:
     """Return the reference of a scenario at a few instants, (p, m), and refuse one of another shape."""
     points = np.asarray(scenario.reference.at(checked_instants(scenario)))
     if points.shape != (POINTS, m) or not np.isfinite(points).all():
-        got = f"shape {points.shape} and {points[:1].tolist()}"
         raise ConfigurationError(
-            f"its reference must be {m} finite features at {POINTS} instants, got {got}"
+            f"its reference must be {m} finite features at {POINTS} instants, got shape {points.shape} and "
+            f"{points[:1].tolist()}"
         )
     return points
 

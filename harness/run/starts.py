@@ -129,11 +129,9 @@ def drawn_moves(
         for start, target in pairs[fit]:
             if stays_in_reach(target, box, setting):
                 yield start, target
-    least = (
-        f"apart by shortest = {box.shortest:g} m and above the table by lowest = {box.lowest:g} m"
-    )
     raise ValueError(
-        f"no start and target between lower and upper are {least}; lessen these, or widen the box"
+        f"no start and target between lower and upper are apart by shortest = {box.shortest:g} m and above "
+        f"the table by lowest = {box.lowest:g} m; lessen these, or widen the box"
     )
 
 
@@ -197,8 +195,10 @@ def draw_in_view(
             if far.any():
                 return found[far.argmax()], posture
             count += 1
-    kept = f"{count} of {MAX_DRAWS} postures between lower and upper are in view and above lowest = {box.lowest:g} m"
-    raise ValueError(f"{kept}, and no two of these are shortest = {box.shortest:g} m apart")
+    raise ValueError(
+        f"{count} of {MAX_DRAWS} postures between lower and upper are in view and above lowest = {box.lowest:g} "
+        f"m, and no two of these are shortest = {box.shortest:g} m apart"
+    )
 
 
 def drawn_together(

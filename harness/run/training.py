@@ -60,5 +60,6 @@ def _check_effects(settings: Settings, controller: str) -> None:
     for section, key, text in settings.assigned:
         topic, _, _ = key.partition(".")
         if (section, topic) != (controller, "training"):
-            depends = f"networks depend on {controller}.training alone"
-            raise ConfigurationError(f"--set {text} has no effect: {depends}")
+            raise ConfigurationError(
+                f"--set {text} has no effect: networks depend on {controller}.training alone"
+            )

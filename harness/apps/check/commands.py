@@ -64,8 +64,9 @@ def new(
                 f"{path} exists already and is left as it is; take another name or --folder"
             )
     if module in sys.stdlib_module_names or module in packages_distributions():
-        hidden = f"a Python package is called {module}, which a file of this name would hide"
-        raise ConfigurationError(f"{hidden}; take another")
+        raise ConfigurationError(
+            f"a Python package is called {module}, which a file of this name would hide; take another"
+        )
     with accessing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():

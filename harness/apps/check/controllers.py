@@ -132,8 +132,10 @@ class ControllerChecks:
                 self.steps = STEPS_IF_SLOW
             driver.run(self.steps - STEPS_IF_SLOW)
         if driver.rig.farthest > 2.0 * driver.rig.spec.joint_upper.max():
-            place = f"{at(driver.controller.step)}: nominal_jacobian is called with {driver.rig.farthest:.3g}"
-            raise CheckFailed(f"{place}; joint positions are in rad")
+            raise CheckFailed(
+                f"{at(driver.controller.step)}: nominal_jacobian is called with {driver.rig.farthest:.3g}; joint "
+                "positions are in rad"
+            )
         self._times, self._printed = driver.times, printed.getvalue()
 
     def limits(self) -> None:
@@ -289,8 +291,10 @@ class ControllerChecks:
                     if after > 1.5 * before
                     else ""
                 )
-                grows = f"the error grows from {before:.2g} to {after:.2g} m in {seconds:g} s"
-                return f"on a made-up arm {grows} with a period of {1e3 * period:g} ms{hint}"
+                return (
+                    f"on a made-up arm the error grows from {before:.2g} to {after:.2g} m in {seconds:g} s with a "
+                    f"period of {1e3 * period:g} ms{hint}"
+                )
         return None
 
     def time(self) -> str | None:

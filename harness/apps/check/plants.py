@@ -256,9 +256,9 @@ def _drive(plant: Plant, setup: PlantSetup) -> tuple[FloatArray, FloatArray, Tru
             f"{', '.join(each.names)} in {each.unit}"
             for each in (spec.feature, setup.model.channel)
         )
-        remedy = "of which controllers get the Jacobian: measure these, or set own_robot = True and bring arm and start"
         raise CheckFailed(
-            f"spec has the features {has}, and the camera of the setup has {camera}, {remedy}"
+            f"spec has the features {has}, and the camera of the setup has {camera}, of which controllers get "
+            "the Jacobian: measure these, or set own_robot = True and bring arm and start"
         )
     first = plant.reset(0).joint_position
     if start is not None and not np.abs(first - start).max() <= START_TOLERANCE:

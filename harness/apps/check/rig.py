@@ -199,8 +199,10 @@ def watching_draws() -> Iterator[list[str]]:
     def noted(bits: int) -> int:
         for frame in reversed(traceback.extract_stack()):
             if is_users(frame.filename):
-                place = f"{show(Path(frame.filename))}:{frame.lineno}"
-                found.append(f"{place}: a generator of random numbers is made without a seed")
+                found.append(
+                    f"{show(Path(frame.filename))}:{frame.lineno}: a generator of random numbers is made without "
+                    "a seed"
+                )
                 break
         return int(original(bits))
 

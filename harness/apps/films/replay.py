@@ -91,8 +91,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
     # A plant may call its joints as it likes
     names = [str(name) for name in track.table if JOINT.fullmatch(str(name))]
     if len(names) != robot.arm.n:
-        wanted = f"wanted the {robot.arm.n} of a {robot.title}"
-        raise ConfigurationError(f"run {run_id} has {len(names)} joint positions [rad]; {wanted}")
+        raise ConfigurationError(
+            f"run {run_id} has {len(names)} joint positions [rad]; wanted the {robot.arm.n} of a {robot.title}"
+        )
     model, moved = _true_model(row, robot)
     q = track.table[names].to_numpy(dtype=np.float64)
     true_feature = track.vectors("true_feature_")
@@ -107,8 +108,10 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
     drawn_ball = model.to_base(model.feature(q))
     offset = float(np.nanmax(np.linalg.norm(drawn_ball - ball, axis=1), initial=0.0))
     if offset > MAX_BALL_OFFSET:
-        why = "films have no play of gears, no flexible tool and no camera that turns"
-        remark(f"run {run_id}: the ball was up to {offset:.2g} m from where it is drawn, as {why}")
+        remark(
+            f"run {run_id}: the ball was up to {offset:.2g} m from where it is drawn, as films have no play of "
+            "gears, no flexible tool and no camera that turns"
+        )
     return LoggedRun(
         track=track,
         robot=robot,

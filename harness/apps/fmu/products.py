@@ -128,9 +128,9 @@ def _repeated_periods(
         (differences(STRETCH).max(), TOLERANCE),
     ):
         if not largest <= most:
-            allowed = f"allowed is {most:.0g}: take another method, sensing or robot"
             raise NotTraceable(
-                f"over {STRETCH} periods it would differ from the original by {largest:.1g}, {allowed}"
+                f"over {STRETCH} periods it would differ from the original by {largest:.1g}, allowed is "
+                f"{most:.0g}: take another method, sensing or robot"
             )
     return int(np.argmin(whole <= 0.1 * TOLERANCE))
 
@@ -216,9 +216,9 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
     resolved = select(request, sections)
     for key in sorted(sections.given.get(request.plant, ())):
         if key.partition(".")[0] not in ("lag", "max_joint_speed", "joint_range", "mechanics"):
-            has = "lag, limits and mechanics, and is seen without noise and latency and commanded a period later"
             raise ConfigurationError(
-                f"the arm of an SSP has {has}: leave {request.plant}.{key} out"
+                "the arm of an SSP has lag, limits and mechanics, and is seen without noise and latency and "
+                f"commanded a period later: leave {request.plant}.{key} out"
             )
     scenario = draw(resolved).scenario
     run = resolved.run

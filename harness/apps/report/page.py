@@ -208,8 +208,10 @@ def page_policy(style: str, scripts: list[str]) -> str:
             sources.append(f"'sha256-{base64.b64encode(digest).decode('ascii')}'")
         return " ".join(sources)
 
-    own = f"style-src {digests([style])}; script-src {digests(scripts)}"
-    return f"default-src 'none'; img-src data:; {own}; base-uri 'none'; form-action 'none'"
+    return (
+        f"default-src 'none'; img-src data:; style-src {digests([style])}; script-src {digests(scripts)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
 
 
 def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:

@@ -85,10 +85,10 @@ def _serve_ros2(request: RunRequest, settings: Settings, *, lockstep: bool) -> N
     try:
         from servobench.harness.apps.serve.ros2 import Robot
     except ImportError as error:
-        remedy = (
-            "on Python 3.12 pip install 'servobench[ros2]', on others source an installed ROS 2"
-        )
-        raise ConfigurationError(f"--protocol ros2 needs rclpy ({error}): {remedy}") from error
+        raise ConfigurationError(
+            f"--protocol ros2 needs rclpy ({error}): on Python 3.12 pip install 'servobench[ros2]', on others "
+            "source an installed ROS 2"
+        ) from error
     from servobench.harness.apps.serve.served import Served
 
     served = Served(request, settings, say, lockstep=lockstep, stamps=True)

@@ -200,10 +200,13 @@ def _overshoot_and_path(tables: Tables) -> Answer:
     runs = tables[MAIN]
     over = pairings(runs, "overshoot", "overshoot, proposed − rival, mean, %", "worse", 100.0)
     path = pairings(runs, "path_length_ratio", "path ratio, proposed − rival, mean", "worse")
-    larger = f"larger overshoot in {held(over)} of {len(over)} pairings"
-    longer = f"longer path in {held(path)} of {len(path)}"
     statement = "its overshoot is larger and its path longer"
-    return answer("2", statement, [*over, *path], f"{larger}, {longer}")
+    return answer(
+        "2",
+        statement,
+        [*over, *path],
+        f"larger overshoot in {held(over)} of {len(over)} pairings, longer path in {held(path)} of {len(path)}",
+    )
 
 
 def _alike(tables: Tables) -> Answer:
@@ -325,8 +328,9 @@ def _reading(tables: Tables, name: str, label: str, statement: str) -> Answer:
         measured.append(Measurement("moves that settled, share", "moves", kind, share))
         measured.append(Measurement("settling time, median, s", "moves", kind, time))
         measured.append(lap)
-        settled = f"settled {100 * share.value:.0f} %"
-        words.append(f"{kind}: {settled}, median {time:.2f} s, circle {lap.estimate:.1f} mm")
+        words.append(
+            f"{kind}: settled {100 * share.value:.0f} %, median {time:.2f} s, circle {lap.estimate:.1f} mm"
+        )
     first, second = _times_of_moves(other).align(_times_of_moves(usual), join="inner")
     found = paired_difference(first, second, margin("settling_time_s", usual))
     words.append(f"mean difference {found.mean:+.2f} s, lost {found.lost[0]} : {found.lost[1]}")

@@ -165,9 +165,12 @@ def claims(
     with watching(console, out, running.execution()) as how:
         answers = reproduction.reproduce(out, names, seeds, how, divisions, mismatch)
     for answer in answers:
-        title = f"{answer.title} on {answer.plant}, {answer.division}"
         verdict = answer.verdict + reproduction.elsewhere(answer, answers)
-        console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
+        console.print(
+            f"[bold]{answer.title} on {answer.plant}, {answer.division}: {verdict}[/bold]",
+            soft_wrap=True,
+            highlight=False,
+        )
         console.print(answer.evidence, markup=False, highlight=False)
     say(f"answers in {out / reproduction.ANSWERS}")
     if wanted is not None:

@@ -63,8 +63,9 @@ def reproduce(
         ConfigurationError: too few or too many robots, a plant that is no UR5, or a folder that cannot be written.
     """
     if not MIN_ROBOTS <= robots <= MAX_SEEDS:
-        wanted = f"at least {MIN_ROBOTS} to tell methods apart, and at most {MAX_SEEDS:,}"
-        raise ConfigurationError(f"--seeds must be {wanted}, got {robots}")
+        raise ConfigurationError(
+            f"--seeds must be at least {MIN_ROBOTS} to tell methods apart, and at most {MAX_SEEDS:,}, got {robots}"
+        )
     if any(find_plant(name).own_robot for name in plants):
         raise ConfigurationError(
             "the claims are about a UR5; --plants names a plant with a robot of its own"
@@ -121,9 +122,9 @@ def read_answers(path: Path) -> Answers:
             usecols=columns,
         )
     except ValueError as error:
-        wanted = f"with the columns {', '.join(columns)}, such as {ANSWERS} of a folder of claims"
         raise ConfigurationError(
-            f"{path} is not a table of answers: wanted one {wanted}"
+            f"{path} is not a table of answers: wanted one with the columns {', '.join(columns)}, such as "
+            f"{ANSWERS} of a folder of claims"
         ) from error
     answers: dict[tuple[str, ...], tuple[str, str]] = {}
     for claim, plant, division, verdict, evidence in table[columns].itertuples(index=False):
@@ -162,9 +163,10 @@ def _agree(found: str, wanted: str) -> bool:
 def markdown_table(answers: Sequence[Answer]) -> str:
     """Return the answers as a table in Markdown."""
     lines = ["| claim | plant | division | verdict | evidence |", "|---|---|---|---|---|"]
-    for a in answers:
-        verdict = f"**{a.verdict}**{elsewhere(a, answers)}"
-        lines.append(f"| {a.title} | {a.plant} | {a.division} | {verdict} | {a.evidence} |")
+    lines += (
+        f"| {a.title} | {a.plant} | {a.division} | **{a.verdict}**{elsewhere(a, answers)} | {a.evidence} |"
+        for a in answers
+    )
     return "\n".join(lines) + "\n"
 
 

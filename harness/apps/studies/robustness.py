@@ -293,8 +293,10 @@ def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
         line = KNOWN_LINES[axis]
         # The unit in the title, " [mm]", becomes the last magnitude with it, " 100 mm".
         ends.append(re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title))
-    value = f"{found.value:g} (interval from {found.low:.0f})"
-    return f"not drawn, as every method has {value} throughout: {'; '.join(ends)}"
+    return (
+        f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: "
+        f"{'; '.join(ends)}"
+    )
 
 
 def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: style.Styles) -> None:

@@ -205,7 +205,6 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         grade = about["grade"] or "ungraded"
         if len(scored) > 0 and bounded(scored).empty:
             grade = "no grade, as its references fail"
-        bound = f"reference {about['reference']} {measure.unit}, lost {about['reference_lost']} %"
         headings = {
             "controller": "controller",
             "runs": "runs",
@@ -215,7 +214,10 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             "score": "score",
             **{name: f"{name}, {METRICS[name].unit}" for name in DECLARED},
         }
-        title = f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}"
+        title = (
+            f"{name!s} ({grade}) on {plant!s}: {titles[name]}; reference {about['reference']} {measure.unit}, "
+            f"lost {about['reference_lost']} %"
+        )
         yield title, place[list(headings)].rename(columns=headings)
     if ranks := ranking_rows(judged):
         count = rows["challenge"].nunique()

@@ -321,8 +321,9 @@ def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
     boxes: dict[str, Any] = dict(find_space(name))
     lines = []
     for key, end in edges(boxes, values).items():
-        box = f"{boxes[key].low:g} to {boxes[key].high:g}"
-        lines.append(f"{key} = {values[key]:.4g} is at the {end} edge of {box}")
+        lines.append(
+            f"{key} = {values[key]:.4g} is at the {end} edge of {boxes[key].low:g} to {boxes[key].high:g}"
+        )
     return tuple(lines)
 
 

@@ -99,8 +99,10 @@ def tune(
     if interrupt is not None:
         _end_interrupted(out)
     if lost:
-        found = f"no run of {', '.join(lost)} came near its target with any settings, so no values are written"
-        raise ConfigurationError(f"{found}; servobench run with the same plant may say why")
+        raise ConfigurationError(
+            f"no run of {', '.join(lost)} came near its target with any settings, so no values are written; "
+            "servobench run with the same plant may say why"
+        )
 
 
 def _counted(plan: TuningPlan) -> str:
@@ -110,8 +112,7 @@ def _counted(plan: TuningPlan) -> str:
     runs = len(plan.runs.runs())
     points = methods * plan.studies * budget
     compared = "1 method" if methods == 1 else f"{methods} methods"
-    factors = f"{compared} × {plan.studies} studies × {budget} points × {runs} runs"
-    return f"{factors} = {points * runs} runs"
+    return f"{compared} × {plan.studies} studies × {budget} points × {runs} runs = {points * runs} runs"
 
 
 def _end_interrupted(out: Path) -> NoReturn:
@@ -168,8 +169,13 @@ def _advance(
                 score = method.ledger.best()
                 best = "–" if score is None else f"{score:.4f}"
                 done = sum(each.done for each in methods)
-                text = f"{method.done} of {total} points, best {best}; in all {done} of {total * len(methods)}"
-                bars.reach(shown[method.name], method.done, f"{method.name}: {text}", best=best)
+                bars.reach(
+                    shown[method.name],
+                    method.done,
+                    f"{method.name}: {method.done} of {total} points, best {best}; in all {done} of "
+                    f"{total * len(methods)}",
+                    best=best,
+                )
     except KeyboardInterrupt as interrupt:
         return interrupt
     return None

@@ -158,9 +158,9 @@ def identify(
     request = resolved.request
     setup, own = find_sensing(request.sensing), find_robot(request.robot)
     if own.twin:
-        wanted = f"identify a table, such as steps.parquet, with --robot {own.twin.keys.robot}"
         raise ConfigurationError(
-            f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}"
+            f"{request.robot} is itself a twin, which no twin can deviate from: identify a table, such as "
+            f"steps.parquet, with --robot {own.twin.keys.robot}"
         )
     if (
         log is None or not log.is_dir()

@@ -81,9 +81,10 @@ def joined(
     table["feature_valid"] = table[CAPTURED].between(clocks.highest, last)
     if not table["feature_valid"].any():
         first = frames.captured[0]
-        span = f"features run from {first:.3f} s on, joints from {begin:.3f} to {end:.3f} s"
-        remedy = "if clocks are apart, write offset = … (in s) in [features] of the map"
-        raise ConfigurationError(f"{features} and {joints} do not overlap: {span}; {remedy}")
+        raise ConfigurationError(
+            f"{features} and {joints} do not overlap: features run from {first:.3f} s on, joints from {begin:.3f} "
+            f"to {end:.3f} s; if clocks are apart, write offset = … (in s) in [features] of the map"
+        )
     further = (("commands", joints, keys.commands), ("reference", features, keys.reference))
     for kind, path, own in further:
         stream = _further_stream(path, kind, own, spec)

@@ -81,11 +81,10 @@ def _check_motion(log: Log, model: RobotModel) -> None:
         fits.append(_image_fit(features[late:][known], modelled[:rows][known], channel.unit))
     unexplained, mirrored = min(fits)
     if unexplained > MAX_UNEXPLAINED.get(channel.unit, MAX_UNEXPLAINED["px"]):
-        found = "features of the log move otherwise than this robot's at these joints"
-        causes = (
-            "other units, another order or sign of joints, another arm, or a camera that was moved"
+        remark(
+            f"features of the log move otherwise than this robot's at these joints, by {unexplained:.0%}: look "
+            "for other units, another order or sign of joints, another arm, or a camera that was moved"
         )
-        remark(f"{found}, by {unexplained:.0%}: look for {causes}")
     elif mirrored:
         remark("features of the log are mirrored: x points right in the image, y down, z ahead")
 

@@ -62,9 +62,11 @@ def check_delay(steps: Steps, ahead: FloatArray) -> None:
     own, *others = map(rms, errors)
     best = int(np.argmin(others))
     if others[best] < MIN_GAIN * own:
-        late = f"features of the log come {delays[best]:g} s after the joint motion"
-        better = f"with this delay the Jacobian would predict them with {others[best] / own:.0%} of the error"
-        remark(f"{late}: {better}; look for the controller's setting of the delay")
+        remark(
+            f"features of the log come {delays[best]:g} s after the joint motion: with this delay the Jacobian "
+            f"would predict them with {others[best] / own:.0%} of the error; look for the controller's setting of "
+            "the delay"
+        )
 
 
 def rms(values: FloatArray) -> float:

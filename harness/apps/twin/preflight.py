@@ -169,8 +169,10 @@ def _units(log: Log, model: RobotModel) -> str:
         return ""
     ratio = logged / max(modelled, 1e-9)
     unit = min(UNITS, key=lambda unit: abs(math.log(ratio * UNITS[unit])))
-    found = f"features move by {logged:.3g} where this arm moves its ball by {modelled:.3g} m"
-    return f"{found}: they are likely in {unit}; write them in m"
+    return (
+        f"features move by {logged:.3g} where this arm moves its ball by {modelled:.3g} m: they are likely in "
+        f"{unit}; write them in m"
+    )
 
 
 def _spread(values: FloatArray) -> FloatArray:
@@ -184,26 +186,31 @@ def _large_errors(log: Log, robot: Identified) -> str:
     share = float(_shares(log, robot).max())
     if share < REFUSED_SHARE or _is_noise(log, robot):
         return ""
-    found = f"errors are {share:.0%} of the motion, and neither one mistake nor two explain them"
-    return f"{found}: check order, directions and zeros of the joints, the axes of the camera, and whether it was moved"
+    return (
+        f"errors are {share:.0%} of the motion, and neither one mistake nor two explain them: check order, "
+        "directions and zeros of the joints, the axes of the camera, and whether it was moved"
+    )
 
 
 def _clocks(log: Log, robot: Identified) -> str:
     """Name clocks of which one is behind the other, or gains on it."""
     latency, deviation = robot.estimate("latency")
     if log.clocks is None and 1e3 * latency < -max(CERTAIN * 1e3 * deviation, MIN_DRIFT):
-        before = f"frames come {-1e3 * latency:.0f} ms before the joints are where they show them"
-        return f"{before}, as clocks of camera and joints are apart: stamp both with one"
+        return (
+            f"frames come {-1e3 * latency:.0f} ms before the joints are where they show them, as clocks of camera "
+            "and joints are apart: stamp both with one"
+        )
     drift, deviation = robot.estimate("drift")
     # Larger where fast frames are late by changing times.
     deviation = max(deviation, _drift_scatter(log, robot))
     total = 1e3 * float(np.ptp(log.time))  # [ms]
     if abs(drift) < max(CERTAIN * deviation, MIN_DRIFT / total):
         return ""
-    size = f"{abs(drift) * total:.0f} ± {1.96 * deviation * total:.1g} ms"
     word = "later" if drift > 0.0 else "earlier"
-    found = f"frames come {size} {word} at the end than at the beginning"
-    return f"{found}, as clocks of camera and joints drift: stamp both with one"
+    return (
+        f"frames come {abs(drift) * total:.0f} ± {1.96 * deviation * total:.1g} ms {word} at the end than at the "
+        "beginning, as clocks of camera and joints drift: stamp both with one"
+    )
 
 
 def _drift_scatter(log: Log, robot: Identified) -> float:
@@ -240,10 +247,11 @@ def _moved(log: Log, model: RobotModel) -> str:
         jump = f"features jump by {size:.2g} {unit} about {time:.0f} s after the beginning"
         shift = _shift(log, model, time)
         if abs(shift) > 0.5 * log.spec.period:
-            frames = f"frames come {1e3 * shift:+.0f} ms later from there on, as where one is lost or doubled"
-            return f"{jump}: {frames}; cut the log there, or shift them"
-        causes = "the camera or the ball was moved, or a frame is lost"
-        return f"{jump}: {causes}; cut the log there"
+            return (
+                f"{jump}: frames come {1e3 * shift:+.0f} ms later from there on, as where one is lost or doubled; "
+                "cut the log there, or shift them"
+            )
+        return f"{jump}: the camera or the ball was moved, or a frame is lost; cut the log there"
     return ""
 
 

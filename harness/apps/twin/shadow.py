@@ -56,8 +56,9 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
             run_loop(*pair, desired, loop, request.seed, log)
     except RunFault as fault:
         row = len(log.steps())
-        where = f"controller {request.controller} fails in row {row} of the log"
-        raise ConfigurationError(f"{where}: {fault}") from fault
+        raise ConfigurationError(
+            f"controller {request.controller} fails in row {row} of the log: {fault}"
+        ) from fault
     finally:
         experiment.plant.close()
     rows = log.steps()

@@ -130,12 +130,13 @@ def read_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stre
     if len(columns) != len(names):
         lacking = [f"{len(names)} fields of values"]
     if lacking:
-        remedy = f"name topic, time and fields in [{kind}] of the map"
         known = suggest(lacking[0], map(str, table))
         fault = ConfigurationError
         if is_table and set(columns).isdisjoint(table):
             fault = StreamAbsent
-        raise fault(f"{what} has no {lacking[0]}; {remedy}: {known}")
+        raise fault(
+            f"{what} has no {lacking[0]}; name topic, time and fields in [{kind}] of the map: {known}"
+        )
     table = table[table[columns].notna().all(axis=1)]
     time = keys.offset + _seconds(what, table, stamps, keys.unit)
     _check_order(what, time)
@@ -160,9 +161,10 @@ def _check_order(what: str, time: FloatArray) -> None:
     steps = np.diff(time)
     grows = np.append(steps > 0.0, steps.size > 0)
     if not grows.all():
-        found = f"stamp {np.argmin(grows) + 1} of {len(time)} is not later than the one before"
         remedy = f"sort two or more, leave out doubled ones, or take others, such as {RECEIVED}"
-        raise UnevenRows(f"{what}: {found}: {remedy}")
+        raise UnevenRows(
+            f"{what}: stamp {np.argmin(grows) + 1} of {len(time)} is not later than the one before: {remedy}"
+        )
     usual = np.median(steps)
     if usual > MAX_STEP:
         remedy = 'write their unit, such as unit = "ns", in the map'
@@ -187,9 +189,10 @@ def _read_topic(path: Path, topic: str) -> pd.DataFrame:
                 message = bag.deserialize(raw, connection.msgtype)
                 rows.append({**dict(_flat("", message)), RECEIVED: NANOSECOND * received})
     except (AnyReaderError, *ReaderErrors, *FAULTS) as error:
-        found = f"{path} cannot be read as a bag ({type(error).__name__}: {error})"
-        remedy = "wanted a finished MCAP file, a rosbag2 folder, .db3 or .bag; `mcap recover` repairs one"
-        raise ConfigurationError(f"{found}; {remedy}") from error
+        raise ConfigurationError(
+            f"{path} cannot be read as a bag ({type(error).__name__}: {error}); wanted a finished MCAP file, a "
+            "rosbag2 folder, .db3 or .bag; `mcap recover` repairs one"
+        ) from error
     table = pd.DataFrame(rows)
     if STAMP in table:  # a publisher may repeat a message, as a robot does that waits in lockstep
         table = table.drop_duplicates([name for name in table if name != RECEIVED])

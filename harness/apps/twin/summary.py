@@ -113,9 +113,10 @@ def held_out_line(log: Log, held: HeldOut | None) -> str:
     if held is None:
         return ""
     unit, _ = handy(log)
-    window = f"held out, {held.begin:.1f} to {held.end:.1f} s, for a fit to the frames before"
-    errors = f"errors [{unit}]: {_sizes(log, held.deviations)}"
-    return f"{window}: {errors}, {held.ratio:.2f} times its residuals"
+    return (
+        f"held out, {held.begin:.1f} to {held.end:.1f} s, for a fit to the frames before: errors [{unit}]: "
+        f"{_sizes(log, held.deviations)}, {held.ratio:.2f} times its residuals"
+    )
 
 
 def handy(log: Log) -> tuple[str, float]:
@@ -138,9 +139,9 @@ def _clock_line(clocks: Clocks, robot: Identified) -> str:
     if clocks.delivery is None:
         return "latency holds the offset of the clocks, which one bag with times of recording tells"
     latency, deviation = robot.estimate("latency")
-    offset = f"{1e3 * (latency - clocks.delivery):+.1f} ± {1960.0 * deviation:.1g} ms"
     return (
-        f"camera's clock ahead of that of the joints, if frames are stamped when exposed: {offset}"
+        "camera's clock ahead of that of the joints, if frames are stamped when exposed: "
+        f"{1e3 * (latency - clocks.delivery):+.1f} ± {1960.0 * deviation:.1g} ms"
     )
 
 
@@ -149,10 +150,10 @@ def _residuals_line(log: Log, robot: Identified) -> str:
     over_time, over_posture = unexplained(log, robot)
     colour = "white" if over_time < MAX_CORRELATION else "not white"
     share = max(0.0, over_posture)
-    correlation = (
-        f"residuals over time are {colour}, correlated over {robot.correlation:.2g} frames"
+    return (
+        f"residuals over time are {colour}, correlated over {robot.correlation:.2g} frames; posture explains "
+        f"{share:.1%} of their variance"
     )
-    return f"{correlation}; posture explains {share:.1%} of their variance"
 
 
 def _drive_lines(log: Log, response: Response | None) -> list[str]:
@@ -161,14 +162,17 @@ def _drive_lines(log: Log, response: Response | None) -> list[str]:
         return [f"not told: delay and lag, as {untold_response(log)}"]
     lines = []
     if response.delay + response.lag < MIN_TIMES:
-        likely = "these are likely their measured speeds; log what was sent"
-        lines.append(f"joints follow commands at once: {likely}")
+        lines.append(
+            "joints follow commands at once: these are likely their measured speeds; log what was sent"
+        )
     elif response.unexplained > SUSPECT_SHARE:
-        left = f"delay and lag leave {response.unexplained:.0%} of joint motion"
-        lines.append(f"{left}: the drive is no first-order lag")
+        lines.append(
+            f"delay and lag leave {response.unexplained:.0%} of joint motion: the drive is no first-order lag"
+        )
     if response.level < math.inf:
-        clipped = f"commands act as if clipped at {response.level:.3g} rad/s"
-        lines.append(f"{clipped}: log them as they are sent")
+        lines.append(
+            f"commands act as if clipped at {response.level:.3g} rad/s: log them as they are sent"
+        )
     return lines
 
 
@@ -180,8 +184,7 @@ def _longer_line(log: Log, robot: Identified) -> str:
     share, widest = max(shares)
     # Half the interval needs four times the information, of which the prior is no part.
     longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)
-    motion = f"at most {longer:.0f} s more of such motion"
-    return f"{motion} would halve the widest interval, that of {widest}"
+    return f"at most {longer:.0f} s more of such motion would halve the widest interval, that of {widest}"
 
 
 def unexplained(log: Log, robot: Identified) -> tuple[float, float]:
