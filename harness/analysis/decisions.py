@@ -7,17 +7,15 @@ runs up to the first look, so that it does not depend on where one stops.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import (
     ALPHA,
-    column_of,
     knows_truth,
     margin,
     metric_heading,
@@ -26,9 +24,8 @@ from servobench.harness.analysis.comparison import (
     split_conditions,
 )
 from servobench.harness.analysis.sequential import CLIP, Decision, decide
-from servobench.harness.analysis.verdict import judged_metric
+from servobench.harness.analysis.verdict import judged_column, judged_metric
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
@@ -41,7 +38,7 @@ Pair = tuple[str, str]
 class Question:
     """What a batch is to decide."""
 
-    pairs: tuple[Pair, ...]  # two controllers each
+    pairs: tuple[Pair, ...]  # controllers, two and two
     worlds: int  # number of worlds in which each is compared
     seeds: tuple[int, ...]  # the budget, ascending
 
@@ -90,118 +87,96 @@ class Question:
 
 
 @dataclass(frozen=True)
-class World:
-    """What is decided of the pairs in one world."""
+class Answer:
+    """What is decided of a pair in one world."""
 
-    words: str  # which one it is
-    measure: str  # metric by which pairs are compared, with its unit
+    world: str  # in words
+    pair: Pair
+    decision: Decision
+    measure: str  # metric by which they are compared, with its unit
     margin: float  # difference that does not matter [unit]
-    decisions: Mapping[Pair, Decision]
-    runs: pd.DataFrame
+    needed: frozenset[str]  # names of the first runs of the controllers that this answer needs
 
-    def closed(self, first: int) -> set[str]:
-        """Return, for each controller of which no more runs are needed, the name of its run with the first seed."""
-        is_open = [pair for pair, each in self.decisions.items() if each.verdict == "undecided"]
-        own = self.runs[self.runs["seed"] == first]
-        if is_open:
-            compared = {name for pair in self.decisions for name in pair}
-            still = {name for pair in is_open for name in pair}
-            own = own[own["controller"].isin(compared - still)]
-        return set(own["run_id"])
+    def row(self) -> dict[str, str]:
+        """Return it as a row of text."""
+        verdict = str(self.decision.verdict)
+        if self.decision.told_by_lost:
+            verdict += ", by lost runs"
+        lost_first, lost_second = self.decision.lost
+        return {
+            "world": self.world,
+            "A − B": " − ".join(self.pair),
+            "verdict": verdict,
+            "seeds": str(self.decision.robots),
+            "runs lost": f"{lost_first} : {lost_second}",
+            "mean difference": number(self.decision.mean * self.margin, "+.2f"),
+            "margin": f"{self.margin:.2g}",
+            "measure": self.measure,
+        }
 
 
-def decide_pairs(values: pd.DataFrame, small: float, question: Question) -> dict[Pair, Decision]:
+def answer(
+    place: pd.DataFrame, words: str, measure: str, small: float, question: Question
+) -> list[Answer]:
     """Return what is decided of each pair in one world.
 
     Args:
-        values: seeds × controllers, less is better; +∞ of a lost run, NaN of one that is not there.
+        place: its runs, with a column `value`: less is better, +∞ of a lost run.
+        words: which world it is.
+        measure: metric of the values, with its unit.
         small: the margin.
         question: which pairs, and when one looks.
     """
+    values = place.pivot_table(index="seed", columns="controller", values="value")
     ordered = values.reindex(index=list(question.seeds))
-    found = {}
-    for first, second in question.pairs:
-        pair = ordered.reindex(columns=[first, second])
-        is_there = pair.notna().all(axis=1).to_numpy()
-        count = len(pair) if is_there.all() else int(np.argmin(is_there))
-        own = pair.iloc[:count]
-        looks = [robots for robots in question.looks if robots <= count]
-        found[first, second] = decide(own[first], own[second], small, question.level, looks)
+    asked = {name for pair in question.pairs for name in pair}
+    first_runs = place[place["seed"] == question.seeds[0]]
+    found = []
+    for pair in question.pairs:
+        own = ordered.reindex(columns=list(pair))
+        is_there = own.notna().all(axis=1).cummin()
+        looks = [robots for robots in question.looks if robots <= is_there.sum()]
+        both = own[is_there]
+        decision = decide(both[pair[0]], both[pair[1]], small, question.level, looks)
+        # Bounds, which nobody asks about, go on with any pair
+        others = asked.difference(pair)
+        needed = first_runs.loc[~first_runs["controller"].isin(others), "run_id"]
+        found.append(Answer(words, pair, decision, measure, small, frozenset(needed)))
     return found
 
 
-def decide_worlds(runs: pd.DataFrame, question: Question) -> list[World]:
+def decide_worlds(runs: pd.DataFrame, question: Question) -> list[Answer]:
     """Return what is decided in each world of a table of runs."""
-    first_look = question.seeds[:EVERY]
-    worlds = []
+    answers = []
     for words, place in split_conditions(runs):
         metric = judged_metric(place)
         _, factor = shown_unit(metric, place)
-        completed = column_of(place, metric).where(place["status"] == COMPLETED)
-        judged = place.assign(value=completed.fillna(np.inf))
-        values = judged.pivot_table(index="seed", columns="controller", values="value")
-        small = margin(metric, place[place["seed"].isin(first_look)])
-        decisions = decide_pairs(values, small, question)
-        worlds.append(World(words, metric_heading(metric, place), factor * small, decisions, place))
-    return worlds
+        at_first = place[place["seed"].isin(question.seeds[:EVERY])]
+        judged = place.assign(value=judged_column(place))
+        measure = metric_heading(metric, place)
+        small = factor * margin(metric, at_first)
+        answers += answer(judged, words, measure, small, question)
+    return answers
 
 
-def needed_after(worlds: Sequence[World], question: Question) -> Callable[[RunRequest], bool]:
+def needed_after(answers: Sequence[Answer], question: Question) -> Callable[[RunRequest], bool]:
     """Return whether a run is still needed: its controller is in a pair of its world that is not decided."""
     first = question.seeds[0]
-    closed = {name for world in worlds for name in world.closed(first)}
+    known = {name for each in answers for name in each.needed}
+    is_open = [each for each in answers if each.decision.verdict == "undecided"]
+    closed = known.difference(*(each.needed for each in is_open))
     return lambda request: replace(request, seed=first).run_id not in closed
 
 
-def decision_rows(worlds: Sequence[World]) -> pd.DataFrame:
-    """Return a row for each world and pair."""
-    rows = []
-    for world in worlds:
-        for (first, second), each in world.decisions.items():
-            row = {
-                "world": world.words,
-                "first": first,
-                "second": second,
-                "verdict": each.verdict,
-                "seeds": each.robots,
-                "told by lost runs": each.told_by_lost,
-                "lost by first": each.lost[0],
-                "lost by second": each.lost[1],
-                "measure": world.measure,
-                "margin": world.margin,
-                "clipped mean difference": each.mean * world.margin,
-            }
-            rows.append(row)
-    return pd.DataFrame(rows)
+def answer_table(answers: Sequence[Answer]) -> pd.DataFrame:
+    """Return a row of text for each world and pair."""
+    return pd.DataFrame([each.row() for each in answers])
 
 
-def decision_tables(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """Return a title and a table of text for each world of `decision_rows`."""
-    tables = []
-    for world, own in rows.groupby("world", sort=False):
-        facts = own.iloc[0]
-        differences = own["clipped mean difference"]
-        table = pd.DataFrame(
-            {
-                "A − B": own["first"] + " − " + own["second"],
-                "verdict": own["verdict"],
-                "after seeds": own["seeds"].astype(str),
-                "runs lost": own["lost by first"].astype(str)
-                + " : "
-                + own["lost by second"].astype(str),
-                f"mean difference in {facts['measure']}": [
-                    number(each, "+.2f") for each in differences
-                ],
-            }
-        )
-        tables.append((f"{world}: margin {facts['margin']:.2g}", table))
-    return tables
-
-
-def decision_legend(question: Question) -> str:
-    """Return what the verdicts hold for."""
+def answer_legend(question: Question) -> str:
+    """Return what verdicts hold for."""
     verdicts = question.worlds * len(question.pairs)
     return (
-        f"verdicts: at most {100.0 * ALPHA:.0f} % of such batches have a false one among {verdicts}, "
-        f"wherever they end; differences count up to {CLIP:g} margins"
+        f"at most {100.0 * ALPHA:.0f} % of such batches have a false one among {verdicts} verdicts, wherever they end; "
+        f"differences count up to {CLIP:g} margins"
     )

@@ -22,10 +22,14 @@ from servobench.harness.analysis.comparison import LOST_MARGIN, Verdict
 from servobench.plant.contract.checks import FloatArray
 
 CLIP = 5.0  # [margins] at which a paired difference is clipped, so that it is bounded
+# For *equivalent*, the difference of lost shares is shown to be less
+LOST_WITHIN = 0.1  # [1]
 # Shares λ as parts of their largest value, and the weights of their wealths: it does most where methods are alike
 PARTS = (0.98, 0.5, 0.25, 0.125)
 WEIGHTS = (0.5, 0.25, 0.125, 0.125)
-BETS = 4  # for less, for more, for fewer and for more lost runs, among which the level is divided
+WITHIN = frozenset({"not more", "not less", "not more lost", "not fewer lost"})
+# For less, for more, for fewer and for more lost runs: the level is divided among them
+BETS = 4
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class Decision:
     verdict: Verdict
     robots: int  # those that were looked at
     told_by_lost: bool  # whether the lost runs decide, not the mean
-    mean: float  # first − second, over robots that neither loses [margins], each clipped at `CLIP`; NaN of none
+    mean: float  # first − second over robots that neither loses [margins], each clipped at `CLIP`; NaN of none
     lost: tuple[int, int]  # number of lost runs of the first and of the second
 
 
@@ -66,8 +70,10 @@ def decide(
     The rules are those of `servobench.harness.analysis.comparison.paired_difference`, with bets in place of its tests.
     Fewer lost runs are better where a bet on them says so. Else, over the robots that neither loses, the mean of
     differences that are clipped at `CLIP` margins decides: better or worse where it is shown to lie beyond the margin,
-    equivalent where it is shown to lie within. For *better* and *worse* the other method must not have lost fewer runs
-    by more than `LOST_MARGIN`, for *equivalent* neither; and the mean without clipping must lie on the same side.
+    equivalent where it is shown to lie within, and the difference of lost shares within `LOST_WITHIN`. For *better* and
+    *worse* the other method must not have lost fewer runs by more than `LOST_MARGIN`, for *equivalent* neither; and the
+    mean without clipping must lie on the same side. Of two bets on one side that with the harder bound is never richer,
+    so that four levels are enough for all eight.
 
     Args:
         first: values by robot, less is better; NaN or +∞ is a lost run.
@@ -98,6 +104,8 @@ def decide(
         "not less": log_wealth(clipped, -bound),
         "more lost": log_wealth(more_lost, 0.0),
         "fewer lost": log_wealth(-more_lost, 0.0),
+        "not more lost": log_wealth(-more_lost, -LOST_WITHIN),
+        "not fewer lost": log_wealth(more_lost, -LOST_WITHIN),
     }
     needed = np.log(BETS / level)
     shown = {name: np.logical_or.accumulate(each >= needed) for name, each in wealths.items()}
@@ -139,7 +147,6 @@ def _verdict(
         return "worse", False
     if "less" in sure and ahead <= few and plain < -margin:
         return "better", False
-    is_within = {"not more", "not less"} <= sure
-    if is_within and abs(ahead) <= few and abs(plain) <= margin:
+    if sure >= WITHIN and abs(ahead) <= few and abs(plain) <= margin:
         return "equivalent", False
     return "undecided", False

@@ -159,8 +159,8 @@ class JudgedPlace(NamedTuple):
     pairs: list[Row]
     measure: str  # metric by which pairs are compared, with its unit; empty without pairs
     margin: str  # difference that does not matter, with its unit; likewise
-    least: str  # difference that the median pair could tell, with its unit; likewise
-    stable: int  # number of pairs that halves of the robots order alike
+    least: str = ""  # difference that the median pair could tell, with its unit; likewise
+    stable: int = 0  # number of pairs that halves of the robots order alike
 
 
 class Statistics(NamedTuple):

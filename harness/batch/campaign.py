@@ -183,6 +183,9 @@ def _carry_out_at(
     side_by_side = (
         _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
     )
+    asked = None
+    if campaign.looks is not None:
+        asked = campaign.looks.record
     manifest = describe_batch(
         runs,
         sections,
@@ -190,7 +193,7 @@ def _carry_out_at(
         side_by_side,
         own,
         steps=campaign.steps,
-        until_decided=campaign.looks.record if campaign.looks else None,
+        until_decided=asked,
     )
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
@@ -295,11 +298,15 @@ def _carry_out_missing(
     begin, end = (
         len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0])
     )
-    ends = campaign.looks.ends if campaign.looks else (len(campaign.cells),)
+    ends: tuple[int, ...] = (len(campaign.cells),)
+    if campaign.looks is not None:
+        ends = campaign.looks.ends
     keep = folder.path if campaign.steps and not place.cluster else None
     for start, stop in pairwise((0, *ends)):
         own_share = range(max(start, begin), max(start, begin, min(stop, end)))
         gaps, missing, done = _gaps(campaign, folder, own_share)
+        if not done + missing:
+            continue
         how.observer.begin(done + missing, done)
         size = even_size(missing, place.count, how.block)
         blocks = cut(jobs(gaps), size, 1 if campaign.steps else CHUNK, own)
@@ -320,7 +327,9 @@ def _gaps(
     gaps = chain.from_iterable(range(one.stop, next_one.start) for one, next_one in pairwise(ends))
     if campaign.looks is None:
         return gaps, len(share) - finished, finished
-    runs = folder.runs(parts=True) if folder.part_indices() else pd.DataFrame()
+    runs = pd.DataFrame()
+    if folder.part_indices():
+        runs = folder.runs(parts=True)
     is_needed = campaign.looks.goes_on(runs)
     needed = [index for index in gaps if is_needed(campaign.cells[index].request)]
     return needed, len(needed), finished

@@ -115,7 +115,9 @@ class ResultsFolder:
                 a column that says which run a row is, or a run's identifier is unfit for the name of a file.
         """
         self.check_finished()
-        names = self.part_names(RUNS) if parts else self._intact(RUNS)
+        names = self.part_names(RUNS)
+        if not parts:
+            names = self._intact(RUNS)
         runs = tables.read_tables(self.path, names)
         first = self.path / names[0]
         refuse_lacking(first, "runs", tables.common_schema(self.path, names))

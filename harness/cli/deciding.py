@@ -9,12 +9,11 @@ import pandas as pd
 
 from servobench.harness.analysis.decisions import (
     DECISIONS,
+    Answer,
     Question,
-    World,
+    answer_legend,
+    answer_table,
     decide_worlds,
-    decision_legend,
-    decision_rows,
-    decision_tables,
     needed_after,
 )
 from servobench.harness.batch.campaign import Campaign
@@ -53,31 +52,28 @@ def ask(
     return Question.ask(names, against, worlds, seeds)
 
 
-def ending_when_decided(
-    campaign: Campaign,
-    question: Question,
-    decided: Callable[[pd.DataFrame, Question], list[World]] = decide_worlds,
-) -> Campaign:
+def ending_when_decided(campaign: Campaign, question: Question) -> Campaign:
     """Return a campaign that ends when its question is decided.
 
     Args:
         campaign: with all runs of the budget.
         question: what it is to decide.
-        decided: returns from the table of runs what is decided in each world.
     """
     cells, ends = in_looks(campaign.cells, question.seeds, question.looks)
 
     def goes_on(runs: pd.DataFrame) -> Callable[[RunRequest], bool]:
-        worlds = [] if runs.empty else decided(runs, question)
-        return needed_after(worlds, question)
+        answers: list[Answer] = []
+        if not runs.empty:
+            answers = decide_worlds(runs, question)
+        return needed_after(answers, question)
 
     return replace(campaign, cells=cells, looks=Looks(ends, goes_on, question.record()))
 
 
-def save_decisions(folder: ResultsFolder, worlds: Sequence[World]) -> None:
+def save_decisions(folder: ResultsFolder, answers: Sequence[Answer]) -> None:
     """Write what is decided beside the tables of a folder."""
     path = folder.path / DECISIONS
-    write_csv(decision_rows(worlds), path)
+    write_csv(answer_table(answers), path)
     folder.vouch([path])
 
 
@@ -85,15 +81,17 @@ def print_stored(folder: ResultsFolder) -> None:
     """Print what was decided when a batch ended, if it was one that ends so."""
     path = folder.path / DECISIONS
     if folder.manifest.get("until_decided") and path.exists():
-        print_tables(decision_tables(pd.read_csv(path)))
+        print_tables([("decided", pd.read_csv(path, dtype=str))])
 
 
-def print_decisions(folder: ResultsFolder, question: Question, budget: int) -> None:
+def print_answers(
+    answers: Sequence[Answer], question: Question, carried_out: int, budget: int
+) -> None:
     """Print what is decided, and how many of the runs of the budget were saved."""
-    print_tables(decision_tables(pd.read_csv(folder.path / DECISIONS)), decision_legend(question))
-    rows = pd.read_csv(folder.path / DECISIONS)
-    decided = int((rows["verdict"] != "undecided").sum())
-    saved = budget - folder.run_count
+    print_tables([("decided", answer_table(answers))], answer_legend(question))
+    decided = sum(each.decision.verdict != "undecided" for each in answers)
+    saved = budget - carried_out
+    share = 100.0 * saved / budget
     say(
-        f"{decided} of {len(rows)} verdicts decided; {saved} of {budget} runs saved ({100 * saved / budget:.0f} %)"
+        f"{decided} of {len(answers)} verdicts decided; {saved} of {budget} runs saved ({share:.0f} %)"
     )

@@ -96,7 +96,10 @@ def statistics(
             {
                 "place": place.words,
                 "controllers": as_plain(place.controllers),
-                "pairs": [{**row, "margin": place.margin} for row in as_plain(place.pairs)],
+                "pairs": [
+                    {**row, "margin": place.margin, "least difference": place.least}
+                    for row in as_plain(place.pairs)
+                ],
             }
             for place in found.places
         ]

@@ -293,7 +293,7 @@ def _carry_out(
     from servobench.harness.analysis.verdict import judge as find_verdict
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.batch.results import ResultsFolder
-    from servobench.harness.cli.deciding import print_decisions, save_decisions
+    from servobench.harness.cli.deciding import print_answers, save_decisions
     from servobench.harness.cli.progress import watching
     from servobench.harness.config.installation import missing_extra
 
@@ -307,7 +307,8 @@ def _carry_out(
         say_methods(opened.manifest)
         print_faults(opened, runs)
         if question is not None:
-            save_decisions(opened, decide_worlds(runs, question))
+            answers = decide_worlds(runs, question)
+            save_decisions(opened, answers)
         if out is None:
             point_latest(folder)
         if with_figures:
@@ -332,7 +333,7 @@ def _carry_out(
                 )
                 say(f"no report: {missing or error}")
         if question is not None:
-            print_decisions(opened, question, len(campaign.cells))
+            print_answers(answers, question, len(runs), len(campaign.cells))
         elif len(runs) > 1:
             finding = find_verdict(runs)
             say("\n".join(["", finding.result, *finding.cautions, ""]).replace("`", ""))

@@ -8,9 +8,8 @@ from kit.folders import made_up_row
 from servobench.harness.analysis.decisions import (
     EVERY,
     Question,
+    answer_table,
     decide_worlds,
-    decision_rows,
-    decision_tables,
     needed_after,
 )
 from servobench.harness.batch.looks import in_looks
@@ -65,17 +64,15 @@ def test_a_question_without_an_answer_is_refused_in_one_line(names, against, see
 
 def test_each_pair_is_decided_in_each_world_at_its_first_look():
     question = Question.ask(METHODS, None, 2, SEEDS)
-    first, second = decide_worlds(runs_of(rls=0.5), question)
-    assert [each.verdict for each in first.decisions.values()] == ["equivalent"] * 3
-    assert [each.verdict for each in second.decisions.values()] == ["better"] * 3
-    assert {each.robots for each in second.decisions.values()} == {16}
-    assert first.margin == pytest.approx(0.05)
-    rows = decision_rows([first, second])
-    assert list(rows["first"][:3]) == ["ukf_mfac", "ukf_mfac", "broyden"]
-    assert rows["clipped mean difference"][3] == pytest.approx(-0.25, abs=0.02)
-    (title, table), _ = decision_tables(rows)
-    assert title == "exp1 on kinematic, moderate: margin 0.05"
-    assert list(table["verdict"]) == ["equivalent"] * 3
+    answers = decide_worlds(runs_of(rls=0.5), question)
+    assert [each.decision.verdict for each in answers] == ["equivalent"] * 3 + ["better"] * 3
+    assert {each.decision.robots for each in answers[3:]} == {16}
+    assert answers[0].margin == pytest.approx(0.05)
+    table = answer_table(answers)
+    assert list(table["A − B"][:2]) == ["ukf_mfac − broyden", "ukf_mfac − rls"]
+    assert table["world"][0] == "exp1 on kinematic, moderate"
+    assert float(table["mean difference"][3]) == pytest.approx(-0.25, abs=0.02)
+    assert list(table["verdict"]) == ["equivalent"] * 3 + ["better"] * 3
 
 
 def test_only_runs_of_pairs_that_are_not_decided_go_on():
@@ -100,13 +97,13 @@ def test_a_look_counts_once_both_methods_have_all_of_its_seeds():
     runs = runs_of()
     runs = runs[(runs["task"] == "exp2")]
     lacking = runs[~((runs["controller"] == "broyden") & (runs["seed"] == SEEDS[20]))]
-    (world,) = decide_worlds(lacking, question)
-    assert world.decisions["ukf_mfac", "broyden"].robots == EVERY
+    (found,) = decide_worlds(lacking, question)
+    assert found.decision.robots == EVERY
     lacking = runs[~((runs["controller"] == "broyden") & (runs["seed"] == SEEDS[3]))]
-    (world,) = decide_worlds(lacking, question)
-    assert world.decisions["ukf_mfac", "broyden"].robots == 0
+    (found,) = decide_worlds(lacking, question)
+    assert found.decision.robots == 0
     whole, shuffled = (decide_worlds(each, question)[0] for each in (runs, runs.sample(frac=1.0)))
-    assert whole.decisions == shuffled.decisions
+    assert whole.decision == shuffled.decision
 
 
 def test_runs_come_look_by_look_in_ascending_seeds():

@@ -53,6 +53,23 @@ def test_the_wealth_ever_reaches_one_over_the_level_as_rarely_as_ville_says(leve
     assert 0.0 < chance <= level
 
 
+def test_of_two_bets_on_one_side_that_with_the_harder_bound_is_never_richer():
+    values = np.random.default_rng(4).uniform(-1.0, 1.0, (200, 30))
+    wealths = [log_wealth(values, bound) for bound in (-0.2, -0.1, 0.0, 0.2)]
+    for easier, harder in itertools.pairwise(wealths):
+        assert (easier >= harder).all()
+
+
+def test_methods_are_equivalent_only_once_lost_runs_are_shown_to_differ_little():
+    """Without a lost run, so that fewer robots say nothing of one in ten."""
+    first, second = drawn(0.0, 0.1)
+    found = decide(first, second, 1.0, 0.05, range(1, 201))
+    assert found.verdict == "equivalent"
+    assert 0.9**found.robots < 0.05
+    late = decide(first, np.where(np.arange(200) < 3, np.inf, second), 1.0, 0.05, range(1, 201))
+    assert late.robots > 100
+
+
 def drawn(mean, deviation, count=200, seed=0):
     """Return values of two methods whose difference has this mean and deviation, in margins."""
     rng = np.random.default_rng(seed)
