@@ -303,7 +303,7 @@ def test_bytes_that_are_no_state_of_this_model_are_refused(version):
     (saved,) = state.world.fmu
     for content in (saved[:-1], b"x" * len(saved)):
         with pytest.raises(FmuError, match="these bytes are no state of this model"):
-            plant.restore(replace(state, world=replace(state.world, fmu=(content,))))
+            plant.restore(state._replace(world=state.world._replace(fmu=(content,))))
     plant.close()
 
 

@@ -16,6 +16,7 @@ from servobench.fmus.controllers.branches import leaves_of
 from servobench.harness.apps.fmu import products as controller_fmu
 from servobench.harness.apps.fmu.inspection import validate_fmu
 from servobench.harness.config.settings import Settings
+from servobench.harness.run import compiled
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import map_arrays
@@ -186,7 +187,7 @@ def test_inputs_that_are_not_finite_and_values_that_are_computed_are_refused():
     ("begin", "fault", "growth"), [(0.0, 1e-6, 0.0), (5.0, 1e-6, 0.0), (0.0, 0.0, 1e-10)]
 )
 def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch, begin, fault, growth):
-    recorded = controller_fmu._step
+    recorded = compiled._step
 
     def faulty(servo, state, inputs):
         state, output = recorded(servo, state, inputs)
@@ -195,7 +196,7 @@ def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch, beg
         )
         return grown if growth else state, output + fault * (inputs["time"] >= begin)
 
-    monkeypatch.setattr(controller_fmu, "_step", faulty)
+    monkeypatch.setattr(compiled, "_step", faulty)
     with pytest.raises(
         ConfigurationError,
         match="over 5 periods it would differ from the original by .e-.., allowed",
