@@ -73,7 +73,10 @@ def ending_when_decided(campaign: Campaign, question: Question) -> Campaign:
 def save_decisions(folder: ResultsFolder, answers: Sequence[Answer]) -> None:
     """Write what is decided beside the tables of a folder."""
     path = folder.path / DECISIONS
-    write_csv(answer_table(answers), path)
+    table = answer_table(answers)
+    # A number: a text that begins with a sign would be marked as one that no spreadsheet may compute
+    table["mean difference"] = pd.to_numeric(table["mean difference"], errors="coerce")
+    write_csv(table, path)
     folder.vouch([path])
 
 
@@ -81,7 +84,7 @@ def print_stored(folder: ResultsFolder) -> None:
     """Print what was decided when a batch ended, if it was one that ends so."""
     path = folder.path / DECISIONS
     if folder.manifest.get("until_decided") and path.exists():
-        print_tables([("decided", pd.read_csv(path, dtype=str))])
+        print_tables([("decided", pd.read_csv(path, dtype=str, keep_default_na=False))])
 
 
 def print_answers(
