@@ -1,7 +1,8 @@
 """Composed controllers in C: the step of a servo, recorded and compiled for this machine.
 
 numpy is the source, and goes on where a controller has no form in C or the machine no compiler. Rows equal those of
-numpy up to rounding; a run in C has the same bits alone and beside others.
+numpy up to rounding, which a method that learns without bounds may magnify; a run in C has the same bits alone and
+beside others.
 """
 
 import contextlib

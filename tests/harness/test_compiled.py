@@ -25,11 +25,12 @@ ROUGH = {
     "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}},
     "random": {"duration": 2.5},
 }
+# An optimiser and a fitted arm have no form in C
+WITHOUT = ("calibrating_mfac", "ukf_mpc", "ukf_mpc:published")
 TRACED = [
     name
-    for name in METHODS
-    if METHODS[name].side_by_side
-    and name not in ("calibrating_mfac", "ukf_mpc", "ukf_mpc:published")
+    for name, entry in METHODS.items()
+    if entry.side_by_side and not entry.needs_truth and name not in WITHOUT
 ]
 
 
