@@ -27,16 +27,17 @@ import pandas as pd
 import generated_tables
 import stored_tables
 from page_studies import STUDIES
-from page_studies.study import Study
+from page_studies.reproduction.rules import MIN_ROBOTS
+from page_studies.study import REPRODUCTION, Study
 from servobench.harness.batch import results
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.installation import CODE_FOLDERS
 from servobench.harness.run.result import CRASHED
 
 ROOT: Final = Path(__file__).parents[1]
+CODE: Final = (*CODE_FOLDERS, "docs/page_studies/reproduction")
 DIGEST: Final = "code.sha256"  # in the folder of a study: of the code that its runs were made with
 DONE: Final = ".done"  # suffix of a file beside a part that is complete; it holds the command
-MIN_ROBOTS: Final = {"claims": 6}  # of a command that refuses fewer
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -125,7 +126,8 @@ def run(words: Sequence[str], out: Path) -> str:
     line = shlex.join(["python" if script else "servobench", *words])
     sys.stderr.write(f"{line} --out {out}\n")
     start = [str(ROOT / words[0])] if script else ["-m", "servobench", words[0]]
-    going_on = ["--resume"] if out.exists() and not script else []
+    resumes = not script or words[0] == REPRODUCTION
+    going_on = ["--resume"] if out.exists() and resumes else []
     ended = subprocess.run(
         [sys.executable, *start, *words[1:], "--out", str(out), *going_on], check=False
     )
@@ -140,7 +142,7 @@ def fewer(command: Sequence[str], robots: int | None) -> list[str]:
     if robots is not None and "--seeds" in words:
         at = words.index("--seeds") + 1
         begin, colon, end = words[at].partition(":")
-        count = max(robots, MIN_ROBOTS.get(words[0], 1))
+        count = max(robots, MIN_ROBOTS) if words[0] == REPRODUCTION else robots
         words[at] = (
             f"{begin}:{min(int(end), int(begin) + count)}" if colon else str(min(int(begin), count))
         )
@@ -150,7 +152,7 @@ def fewer(command: Sequence[str], robots: int | None) -> list[str]:
 def code_digest() -> str:
     """Return a digest of the code that results depend on."""
     digest = hashlib.sha256()
-    for top in CODE_FOLDERS:
+    for top in CODE:
         for path in sorted((ROOT / top).rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".md":
                 digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())

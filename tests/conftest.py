@@ -19,7 +19,7 @@ from hypothesis import settings
 
 SLOW = {  # folders and files whose tests are all slow
     "closed_loop", "end_to_end", "films", "report", "tuning", "test_adapters", "test_analyse", "test_blocks",
-    "test_chain", "test_check", "test_claims", "test_controller_fmu", "test_drives", "test_engine",
+    "test_chain", "test_check", "test_controller_fmu", "test_drives", "test_engine",
     "test_environments", "test_exit_codes", "test_fmu_model", "test_fmu_standard", "test_fmu_symbolic", "test_help",
     "test_integrity", "test_lists", "test_loops", "test_on_a_ur", "test_outcome", "test_page_tables",
     "test_plant_lanes", "test_robot_runs", "test_robots", "test_sensing_runs", "test_served_browser", "test_setups",

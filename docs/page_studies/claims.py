@@ -14,9 +14,9 @@ import pandas as pd
 
 import stored_tables
 from page_studies import cells
-from page_studies.study import ENGINES, FIVE, RENDERED, Study, sweep
-from servobench.harness.apps.studies.claims import UNDECIDED
-from servobench.harness.apps.studies.reproduction import ANSWERS
+from page_studies.reproduction.answers import ANSWERS
+from page_studies.reproduction.rules import UNDECIDED
+from page_studies.study import ENGINES, FIVE, RENDERED, REPRODUCTION, Study, sweep
 from servobench.harness.batch.results import load_runs
 
 FIRST, SECOND = ENGINES
@@ -135,8 +135,8 @@ CLAIMS = Study(
     "the paper's seven claims, for the methods best equipped and as published",
     40,
     {
-        "exact": ("claims", "--plants", "kinematic,fmu", "--seeds", "500"),
-        "rendered": ("claims", "--plants", "bullet", "--seeds", "10"),
+        "exact": (REPRODUCTION, "--plants", "kinematic,fmu", "--seeds", "500"),
+        "rendered": (REPRODUCTION, "--plants", "bullet", "--seeds", "10"),
     },
     claims_tables,
 )
@@ -145,7 +145,7 @@ CLAIMS_ENGINES = Study(
     "the paper's seven claims on the second physics engine, with as many robots as on the first",
     5,
     {
-        division: ("claims", "--plants", SECOND, "--seeds", "10", "--division", division)
+        division: (REPRODUCTION, "--plants", SECOND, "--seeds", "10", "--division", division)
         for division in ("equipped", "published")
     },
     engines_tables,
@@ -159,7 +159,7 @@ LAB = Study(
             "kinematic", RENDERED, "random,circle", SEEDS, "--mismatch", ",".join(PROFILES)
         ),
         **{
-            name: ("claims", "--plants", "kinematic", "--seeds", "100", "--mismatch", name)
+            name: (REPRODUCTION, "--plants", "kinematic", "--seeds", "100", "--mismatch", name)
             for name in PROFILES
         },
     },

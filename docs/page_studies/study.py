@@ -16,6 +16,7 @@ Tables: TypeAlias = Mapping[str, pd.DataFrame]  # text cells, by name of the tab
 # Arguments of `servobench`, or a script of this project and its arguments
 Words: TypeAlias = tuple[str, ...]
 Command: TypeAlias = Words | Callable[[Path], Words]
+REPRODUCTION: Final = "docs/reproduction.py"  # the script that answers the paper's claims
 ENGINES: Final = ("bullet", "mujoco")
 BETTER: Final = "regression_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper

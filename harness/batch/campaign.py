@@ -1,6 +1,6 @@
 """The one driver of all batches: runs into one results folder, resumable, with every failure of a run as a row.
 
-`compare`, `sweep`, `robustness` and `claims` are campaigns; `tune` uses the lower half, the module `blocks`. Each
+`compare`, `sweep`, `robustness` and `suite` are campaigns; `tune` uses the lower half, the module `blocks`. Each
 finished block of runs becomes a part of the results folder, written by this process. A campaign that is resumed carries
 out the runs without a part, so that its tables are those of an undisturbed one, wall-clock columns aside. Runs are made
 when they are needed, so that the memory of this process does not grow with their number.

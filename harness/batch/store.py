@@ -96,24 +96,6 @@ def _write_picture(path: Path, result: RunResult) -> None:
     write_atomically(path, lambda file: file.write_bytes(content))
 
 
-def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: Manifest) -> None:
-    """Make a folder that holds several sweeps a results folder itself: one table of all their runs.
-
-    Args:
-        folder: the folder.
-        sweeps: tables of runs by the name of the sweep; it becomes the column `part`.
-        manifest: of the whole.
-
-    Raises:
-        UnwritableFolder: the folder takes no more files.
-    """
-    runs = pd.concat([table.assign(part=name) for name, table in sweeps.items()], ignore_index=True)
-    rows = pa.Table.from_pandas(runs, preserve_index=False).replace_schema_metadata()
-    with writing(folder):
-        write_vouched(folder, {RUNS: partial(tables.write_table, rows)})
-        write_manifest(folder, manifest)
-
-
 def collect(folder: ResultsFolder) -> int:
     """Put the parts together into the two tables and the log and, unless runs are missing, remove them.
 

@@ -37,9 +37,7 @@ APPLICATIONS = {
     ),
     "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
     "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
-    "studies": Application(
-        "claims, challenges and the robustness map", ("robustness", "suite", "claims")
-    ),
+    "studies": Application("challenges and the robustness map", ("robustness", "suite")),
     "figures": Application("pictures of a results folder, drawn from its tables", ("figures",)),
     "exports": Application("steps of runs for other tools", ("export",)),
     "films": Application("films and snapshots of runs", ("record",), "animation"),
@@ -56,7 +54,7 @@ PANELS = {  # title on the help page -> commands, in the order of first use
     "First steps": ("run", "compare", "statistics", "report", "figures", "record", "play"),
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
-    "Studies": ("sweep", "analyse", "robustness", "suite", "claims", "tune"),
+    "Studies": ("sweep", "analyse", "robustness", "suite", "tune"),
     "Tools": ("train", "collect", "merge", "export", "verify", "fmu"),
 }
 

@@ -155,7 +155,6 @@ CAMERA_WORDS = (
 )
 SENSING_WORDS = "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand."
 NO_WORLD = {  # command -> why it has neither --robot nor --camera nor --sensing
-    "claims": "the claims are those of the paper, which are about a UR5 and the ball in 3-D before the bench's camera",
     "suite": "challenges are graded on the UR5 and the ball in 3-D, with the camera of their files; compare and sweep "
     "take others",
     "tune": "methods are tuned on the UR5 alone, by the ball in 3-D before the bench's camera, and others take these "

@@ -21,7 +21,7 @@ SHOWN = re.compile(r"^ {4,6}(?:\$ )?servobench (.*)$", re.MULTILINE)
 REMARK = re.compile(r"\s+#\s.*$|\s{2,}\S.*$")
 CONTINUED = re.compile(r"\s*\\\n\s+")
 # Carried out up to the first worker
-BATCHES = ("run", "compare", "sweep", "robustness", "suite", "claims")
+BATCHES = ("run", "compare", "sweep", "robustness", "suite")
 QUICK = ("plants", "controllers", "tasks", "sensing", "init", "new", "check")  # carried out whole
 ONLY_READ = {
     "fmu": "compiles a model, which test_robot_commands.py does",

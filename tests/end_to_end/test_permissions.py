@@ -68,8 +68,6 @@ CASES = {  # call -> (what may not be used, its mode, words of the line)
     "record results --out locked/films": ("locked", LOCKED, "locked/films cannot be written: Permission denied"),
     "record --plant kinematic --out locked/films": (
         "locked", LOCKED, "locked/films cannot be written: Permission denied"),
-    "claims --seeds 6 --plants kinematic --out locked/new": (
-        "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
     "tune --trials 2 --controllers ukf_mfac --out locked/new": (
         "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
     "shadow steps.csv --controller constant --out locked/seen.csv": (

@@ -21,7 +21,7 @@ from kit.nightly import NIGHTLY, some
 from kit.own import write
 from page_studies import STUDIES, cells, held_out, knowledge, physical, pictures, worlds
 from page_studies.pictures import README
-from page_studies.study import ENGINES, Study, nothing, sweep
+from page_studies.study import ENGINES, REPRODUCTION, Study, nothing, sweep
 from servobench.harness.apps.studies import robustness
 from servobench.harness.batch import results
 from servobench.harness.batch.plan import TUNING, Batch, SweepPlan, parse_seeds
@@ -109,6 +109,24 @@ def test_a_study_that_was_interrupted_goes_on_and_one_of_other_code_begins_anew(
     (folder / renewal.DIGEST).write_text("other code")
     renewal.carry_out(study, toy, None, [], keep=False)
     assert [name for name, _ in carried_out[3:]] == ["first", "second"]
+
+
+def test_the_reproduction_of_the_paper_goes_on_and_keeps_its_least_number_of_robots(
+    monkeypatch, tmp_path
+):
+    called = []
+
+    def note(words, **_):
+        called.append(words[1:])
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(renewal, "subprocess", SimpleNamespace(run=note))
+    words = renewal.fewer((REPRODUCTION, "--seeds", "500"), 2)
+    assert words == [REPRODUCTION, "--seeds", "6"]
+    assert renewal.run(words, tmp_path / "new") == "python docs/reproduction.py --seeds 6"
+    renewal.run(words, tmp_path)
+    begun = [str(ROOT / REPRODUCTION), "--seeds", "6", "--out"]
+    assert called == [[*begun, str(tmp_path / "new")], [*begun, str(tmp_path), "--resume"]]
 
 
 def test_a_command_that_fails_ends_the_call_with_one_line(toy):

@@ -365,22 +365,6 @@ def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
     np.testing.assert_array_equal(colours, np.full((12, 16, 3), (200, 30, 10)))
 
 
-def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
-    tables = {
-        name: pd.DataFrame([made_up_row(f"{name}{i}", seed=i) for i in range(2)]) for name in "ab"
-    }
-    store.write_summary(folder, tables, {"parts": ["a", "b"]})
-    runs = results.load_runs(folder)
-    assert runs[["run_id", "part"]].values.tolist() == [
-        ["a0", "a"],
-        ["a1", "a"],
-        ["b0", "b"],
-        ["b1", "b"],
-    ]
-    assert list(runs) == [*tables["a"], "part"]
-    assert ResultsFolder(folder).manifest["parts"] == ["a", "b"]
-
-
 def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, monkeypatch):
     monkeypatch.setattr(tables, "ROW_GROUP", 2)
     for index in range(5):

@@ -32,9 +32,7 @@ def draw(opened: ResultsFolder) -> list[Path]:
 
 
 def figures(
-    folder: Annotated[
-        Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")
-    ],
+    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare or sweep.")],
     kind: Annotated[
         str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")
     ] = "all",

@@ -16,9 +16,7 @@ SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 
 
 def report(
-    folder: Annotated[
-        Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")
-    ],
+    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare or sweep.")],
     out: Annotated[
         Path | None, option("FILE", "The page; default: report.html in the folder.")
     ] = None,

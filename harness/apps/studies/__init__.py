@@ -1,1 +1,1 @@
-"""Studies: the paper's claims and their reproduction, tuning, the robustness map."""
+"""Studies: challenges with their scores, and the robustness map."""

@@ -1,16 +1,14 @@
-"""The commands `servobench robustness | suite | claims`: studies that compare methods."""
+"""The commands `servobench robustness | suite`: studies that compare methods."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import PLANT, Value, option
 from servobench.harness.cli.results import judge, print_lacking
 from servobench.harness.cli.selection import Names, accepted
-from servobench.harness.cli.terminal import FAILED, console, print_tables, say
+from servobench.harness.cli.terminal import console, print_tables, say
 from servobench.plant.contract.files import split_words
 
 DEFAULT_CONTROLLERS = (
@@ -125,56 +123,3 @@ def suite(
     print_tables(suite_tables(shown), "score: reference over method, at most 1; 0 for a lost run")
     say("\n".join(describe_tuning(manifest)))
     say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")
-
-
-def claims(
-    *,
-    out: options.FolderOption,
-    plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[
-        int, option("COUNT", "Robots for each move; two fifths of them for the circle.")
-    ] = 500,
-    division: Annotated[
-        Literal["equipped", "published", "both"],
-        option(
-            "NAME",
-            "Form of the methods: equipped (all aids), published (the law as printed) or both.",
-        ),
-    ] = "both",
-    mismatch: options.MismatchOption = "moderate",
-    running: options.Running,
-    check: Annotated[
-        Path | None,
-        option(
-            "FILE",
-            "Table of answers that must come out the same; the exit code is 1 if they differ.",
-        ),
-    ] = None,
-) -> None:
-    """Answer the paper's seven claims with statistics.
-
-    The figure behind each answer is drawn as well.
-    """
-    from servobench.harness.apps.studies import reproduction
-    from servobench.harness.apps.studies.claims import DIVISIONS
-    from servobench.harness.cli.progress import watching
-
-    names = selection.split("plants", plants)
-    divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
-    wanted = None if check is None else reproduction.read_answers(check)
-    with watching(console, out, running.execution()) as how:
-        answers = reproduction.reproduce(out, names, seeds, how, divisions, mismatch)
-    for answer in answers:
-        verdict = answer.verdict + reproduction.elsewhere(answer, answers)
-        console.print(
-            f"[bold]{answer.title} on {answer.plant}, {answer.division}: {verdict}[/bold]",
-            soft_wrap=True,
-            highlight=False,
-        )
-        console.print(answer.evidence, markup=False, highlight=False)
-    say(f"answers in {out / reproduction.ANSWERS}")
-    if wanted is not None:
-        lines = reproduction.differences(answers, wanted)
-        say("\n".join(lines) or f"the same answers as in {check}")
-        if lines:
-            sys.exit(FAILED)

@@ -1,4 +1,6 @@
-"""The reproduction of the paper: carry out its runs, answer its claims, write tables."""
+"""Tables of the answers to the paper's claims: written, read, and compared with stored ones."""
+
+from __future__ import annotations
 
 import io
 import re
@@ -11,23 +13,10 @@ from typing import TypeAlias
 import numpy as np
 import pandas as pd
 
-from servobench.harness.apps.studies.claims import (
-    MAIN,
-    UNDECIDED,
-    Answer,
-    answer_all,
-    studies,
-)
-from servobench.harness.batch import store
-from servobench.harness.batch.campaign import Execution, carry_out_parts
-from servobench.harness.batch.lock import locked
-from servobench.harness.batch.plan import MAX_SEEDS
-from servobench.harness.batch.results import ResultsFolder
-from servobench.harness.config.registry import find_plant
+from page_studies.reproduction.rules import UNDECIDED, Answer
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_text, write_atomically
 
-MIN_ROBOTS = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
 ANSWERS = "answers.csv"
 MEASUREMENTS = "measurements.csv"
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
@@ -36,57 +25,6 @@ RELATIVE = 0.1  # [1]
 ABSOLUTE = 0.051  # [s] for times
 # Claim, plant, division -> verdict, evidence
 Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]
-
-
-def reproduce(
-    out: Path,
-    plants: Sequence[str],
-    robots: int,
-    how: Execution,
-    divisions: Sequence[str],
-    mismatch: str,
-) -> list[Answer]:
-    """Carry out the runs and answer the claims.
-
-    Args:
-        out: folder for runs and tables.
-        plants: names.
-        robots: number of robots for each move; two fifths of them for the circle.
-        how: how the runs are carried out.
-        divisions: how the methods are equipped, keys of `servobench.harness.apps.studies.claims.DIVISIONS`.
-        mismatch: of all robots.
-
-    Returns:
-        The answers of all plants and divisions, by claim.
-
-    Raises:
-        ConfigurationError: too few or too many robots, a plant that is no UR5, or a folder that cannot be written.
-    """
-    if not MIN_ROBOTS <= robots <= MAX_SEEDS:
-        raise ConfigurationError(
-            f"--seeds must be at least {MIN_ROBOTS} to tell methods apart, and at most {MAX_SEEDS:,}, got {robots}"
-        )
-    if any(find_plant(name).own_robot for name in plants):
-        raise ConfigurationError(
-            "the claims are about a UR5; --plants names a plant with a robot of its own"
-        )
-    made = {division: studies(plants, robots, division, mismatch) for division in divisions}
-    answers: list[Answer] = []
-    main = {}
-    with locked(out):
-        for division, parts in made.items():
-            folder = out / division.replace(" ", "_")
-            tables = carry_out_parts(parts, folder, how)
-            for plant in plants:
-                answers += answer_all(tables, plant, division)
-            main[division] = tables[MAIN]
-            manifest = ResultsFolder(folder / MAIN).manifest
-        answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
-        store.write_summary(out, main, manifest)
-        write_tables(answers, out)
-        write = partial(Path.write_text, data=markdown_table(answers), encoding="utf-8")
-        write_atomically(out / "answers.md", write)
-    return answers
 
 
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:

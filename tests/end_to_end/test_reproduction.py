@@ -1,15 +1,27 @@
 """The answers to the paper's claims: the rules on tables with a known outcome, and the command on real runs."""
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from kit.command import no_file_above
-from servobench.harness.apps.studies import claims, reproduction
-from servobench.harness.apps.studies.claims import (
+import reproduction
+from kit.command import carried_out, no_file_above
+from kit.documents import ROOT
+from kit.folders import made_up_row
+from page_studies.reproduction import rules
+from page_studies.reproduction.answers import (
+    differences,
+    elsewhere,
+    markdown_table,
+    read_answers,
+    write_tables,
+)
+from page_studies.reproduction.rules import (
     CIRCLE,
     DEPENDS,
     ENTRIES,
@@ -26,14 +38,9 @@ from servobench.harness.apps.studies.claims import (
     answer_all,
     studies,
 )
-from servobench.harness.apps.studies.reproduction import (
-    differences,
-    elsewhere,
-    markdown_table,
-    read_answers,
-    write_tables,
-)
+from servobench.harness.batch import results
 from servobench.harness.batch.plan import TUNING
+from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.settings import Settings
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -275,11 +282,30 @@ def test_the_methods_as_published_are_answered_for_under_their_plain_names():
     assert names == {f"{name}:published" for name in METHODS}
 
 
-def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(refusal_of, tmp_path):
+def called(capsys, *words, code=0):
+    """Return what the program wrote to standard output and error."""
+    with pytest.raises(SystemExit) as stop:
+        reproduction.main([str(word) for word in words])
+    shown = capsys.readouterr()
+    assert int(stop.value.code or 0) == code, shown.err
+    return shown.out + shown.err
+
+
+def test_the_program_says_its_options_and_refuses_a_wrong_one():
+    program = (sys.executable, ROOT / "docs" / "reproduction.py")
+    shown = carried_out(*program, "--help")
+    assert shown.returncode == 0, shown.stderr
+    for name in "plants", "seeds", "division", "mismatch", "workers", "resume", "check":
+        assert f"--{name}" in shown.stdout
+    ended = carried_out(*program, "--out", "new", "--division", "equiped")
+    assert ended.returncode == 2
+    assert "'equiped' is not one of 'equipped', 'published'" in ended.stderr
+
+
+def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(capsys, tmp_path):
     made = studies(["kinematic"], 6, "best equipped", "lab")
     assert all("-lab-" in cell.request.run_id for study in made.values() for cell in study.cells)
     wrong = (
-        "claims",
         "--plants",
         "kinematic",
         "--seeds",
@@ -287,10 +313,33 @@ def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(refusal_of
         "--mismatch",
         "labs",
         "--out",
-        str(tmp_path / "out"),
+        tmp_path / "out",
     )
-    assert "lab" in refusal_of(*wrong)
+    assert "did you mean 'lab'?" in called(capsys, *wrong, code=2)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--seeds", "2"), "--seeds must be at least 6"),
+        (("--seeds", "1000001"), "methods apart, and at most 1,000,000, got 1000001\n"),
+        (
+            ("--plants", f"{ROOT}/docs/examples/planar/planar.py"),
+            "--plants names a plant with a robot of its own",
+        ),
+        (("--check", "none.csv"), "answers none.csv cannot be read: No such file or directory"),
+        (("--check", "columns.csv"), "columns.csv is not a table of answers: wanted"),
+    ],
+)
+def test_a_call_that_cannot_be_answered_is_one_line(capsys, monkeypatch, tmp_path, words, told):
+    monkeypatch.chdir(tmp_path)
+    Path("columns.csv").write_text("claim,plant\n1,kinematic\n")
+    line = called(capsys, *words, "--out", "new", code=2)
+    assert told in line
+    assert line.startswith("reproduction: ")
+    assert line.count("\n") == 1
+    assert not Path("new").exists()
 
 
 def test_every_answer_is_in_the_table():
@@ -315,30 +364,20 @@ def brief_studies(*arguments):
     }
 
 
-def test_the_command_answers_from_real_runs_and_says_the_same_again(
-    output_of, monkeypatch, tmp_path
-):
-    monkeypatch.setattr(claims, "TIMED_ROBOTS", 1)
+def test_the_program_answers_from_real_runs_and_says_the_same_again(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(rules, "TIMED_ROBOTS", 1)
     monkeypatch.setattr(reproduction, "studies", brief_studies)
     short = (
-        "claims",
-        "--plants",
-        "kinematic",
-        "--seeds",
-        "6",
-        "--workers",
-        "1",
-        "--division",
-        "equipped",
-    )
-    shown = output_of(*short, "--out", tmp_path / "first")
+        "--plants", "kinematic", "--seeds", "6", "--workers", "1", "--division", "equipped",
+    )  # fmt: skip
+    shown = called(capsys, *short, "--out", tmp_path / "first")
     assert "1: converges faster than the other three on kinematic, best equipped" in shown
     wanted = tmp_path / "wanted.csv"
     wanted.write_text((tmp_path / "first" / "answers.csv").read_text())
-    again = (*short, "--out", str(tmp_path / "first"), "--resume", "--check", str(wanted))
-    assert "the same answers as in" in output_of(*again)
+    again = (*short, "--out", tmp_path / "first", "--resume", "--check", wanted)
+    assert "the same answers as in" in called(capsys, *again)
     wanted.write_text(wanted.read_text().replace("faster in", "faster by far in"))
-    assert "claim 1 on kinematic, best equipped: now" in output_of(*again, code=1)
+    assert "claim 1 on kinematic, best equipped: now" in called(capsys, *again, code=1)
 
 
 def test_few_robots_with_frozen_learning_are_compared_with_the_same_robots_learning():
@@ -347,3 +386,19 @@ def test_few_robots_with_frozen_learning_are_compared_with_the_same_robots_learn
     found = {answer.claim: answer for answer in answer_all(made, "kinematic")}["7"]
     # Robots of one table alone counted as lost.
     assert "exp1 10.0 / 10.0 %" in found.evidence
+
+
+def test_a_folder_of_several_sweeps_has_one_table_that_names_them(tmp_path):
+    tables = {
+        name: pd.DataFrame([made_up_row(f"{name}{i}", seed=i) for i in range(2)]) for name in "ab"
+    }
+    reproduction.write_summary(tmp_path, tables, {"parts": ["a", "b"]})
+    runs = results.load_runs(tmp_path)
+    assert runs[["run_id", "part"]].values.tolist() == [
+        ["a0", "a"],
+        ["a1", "a"],
+        ["b0", "b"],
+        ["b1", "b"],
+    ]
+    assert list(runs) == [*tables["a"], "part"]
+    assert ResultsFolder(tmp_path).manifest["parts"] == ["a", "b"]
