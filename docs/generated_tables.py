@@ -16,7 +16,6 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- studies: docs/page_studies -->
     <!-- methods: table -->
     <!-- methods: presets -->
-    <!-- options: shared -->
     <!-- attributes: observation=plant/contract/signals.py:Observation -->
     <!-- interface: servobench.run,servobench.load -->
     <!-- install: report -->
@@ -55,7 +54,6 @@ from page_studies import STUDIES
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, PUBLISHED, Part
 from servobench.fmus.export import arm_layout
-from servobench.harness.cli.main import command_line
 from servobench.harness.config import registry
 from servobench.harness.config.description import describe_settings, toml
 from servobench.harness.config.installation import CODE_FOLDERS
@@ -71,7 +69,7 @@ PAGES = [
     ROOT / "fmus" / "ur5_mismatched" / "readme.md",
 ]
 PART = re.compile(
-    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options|install|attributes|interface): "
+    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|install|attributes|interface): "
     r"(\S+) -->\n)(.*?)(<!-- end -->)",
     re.DOTALL,
 )
@@ -106,7 +104,6 @@ def renewed(page: Path) -> str:
         "variables": lambda _: variables_table(),
         "studies": lambda _: studies_table(),
         "methods": lambda part: presets_table() if part[3] == "presets" else methods_table(),
-        "options": lambda _: options_table(),
         "install": lambda part: install_lines(part[3]),
         "attributes": lambda part: attributes_table(labelled(part[3])),
         "interface": lambda part: interface(part[3].split(",")),
@@ -136,35 +133,6 @@ def studies_table() -> str:
     """Return the table of the studies behind the measured tables and pictures."""
     rows = [(f"`{study.name}`", study.purpose, f"{study.minutes:g}") for study in STUDIES.values()]
     return table(("study", "what it measures", "minutes on two processors"), rows)
-
-
-def options_table() -> str:
-    """Return the table of the options that several commands have with one meaning."""
-    commands = command_line().commands
-    owners: dict[tuple[str, str], list[str]] = {}
-    for name, each in [
-        *commands.items(),
-        *((f"fmu {name}", each) for name, each in commands["fmu"].commands.items()),
-    ]:
-        for option in each.params:
-            if option.param_type_name == "option":
-                words = (
-                    "`"
-                    + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip()
-                    + "`"
-                )
-                owners.setdefault(
-                    (words, option.help.replace("\\[", "[").replace("<", "\\<")), []
-                ).append(name)
-    # The list of a name says the same
-    several = {words.removesuffix("S`") + "`" for words, _ in owners}
-    meanings: dict[str, list[str]] = {}
-    for (words, meaning), names in owners.items():
-        if len(names) > 1 and words not in several:
-            meanings.setdefault(words, []).append(meaning)
-    return table(
-        ("option", "meaning"), [(words, " Or: ".join(each)) for words, each in meanings.items()]
-    )
 
 
 def methods_table() -> str:
@@ -243,7 +211,7 @@ def measured(part: re.Match[str], folder: Path) -> str:
     if not all(path.exists() for path in paths):
         return part[4].strip("\n")
     stamp, rows = stored_tables.read(paths[0])
-    origin = f"commit {stamp['commit'][:12]}, version {stamp['version']}"
+    origin = f"commit {stamp['commit'][:12]}"
     links = {path.stem: Path(os.path.relpath(path, folder)).as_posix() for path in paths}
     if part[2] == "stored":
         listed = ", ".join(f"[`{name}`]({link})" for name, link in links.items())
