@@ -320,34 +320,21 @@ def _variable(variable: Any, path: Path, units: Mapping[str, Any]) -> Variable: 
             f"fmu file {path} has a variable {_line(repr(name))} with the value reference {_line(reference)}; wanted a "
             "name and 32 bits"
         )
-    axes = tuple(_axis(dimension, variable, path) for dimension in variable.dimensions or ())
-    size = prod(each for _, each in axes)
+    axes = []
+    for dimension, length in zip(variable.dimensions, variable.shape, strict=True):
+        if not 0 <= length <= MAX_NUMBERS:
+            raise _bad_size(variable, path, length)
+        parameter = ""
+        if dimension.start is None:
+            parameter = str(dimension.variable.name)
+        axes.append((parameter, length))
+    size = prod(variable.shape)
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
     causality = variable.causality or "local"
     settable = variable.variability != "constant" and variable.initial != "calculated"
     unit = _unit(variable, units)
-    return Variable(name, reference, size, causality, variable.type, axes, unit, settable)
-
-
-def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above
-    """Return the structural parameter that gives the size of an axis, or no name, and its size."""
-    parameter = ""
-    start = dimension.start
-    if start is None:
-        parameter = str(getattr(dimension.variable, "name", ""))
-        start = getattr(dimension.variable, "start", None)
-    if start is None:
-        raise ValueError(
-            f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value"
-        )
-    try:
-        size = int(start)
-    except (TypeError, ValueError):
-        size = -1
-    if not 0 <= size <= MAX_NUMBERS:
-        raise _bad_size(variable, path, start)
-    return parameter, size
+    return Variable(name, reference, size, causality, variable.type, tuple(axes), unit, settable)
 
 
 def _bad_size(variable: Any, path: Path, came: object) -> ValueError:  # noqa: ANN401 - as above

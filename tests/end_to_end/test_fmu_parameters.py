@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kit.foreign_fmu import ROLES, build_crane, describe_with
-from servobench.harness.apps.fmu.inspection import read_information, shape_of
+from servobench.harness.apps.fmu.inspection import read_information
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 
@@ -81,9 +81,7 @@ def test_results_of_single_precision_are_features(tmp_path):
 
 def test_information_tells_sizes_that_parameters_give(tmp_path):
     path = build_crane(tmp_path / "crane.fmu", 3)
-    shapes = {
-        each.name: shape_of(each) for each in read_information(path).description.modelVariables
-    }
+    shapes = {each.name: each.shape for each in read_information(path).description.modelVariables}
     assert (shapes["wheel"], shapes["probe"], shapes["gear"]) == ((2,), (1,), ())
 
 

@@ -181,7 +181,7 @@ def validate(file: FileArgument) -> None:
 @fmu.command()
 def info(file: FileArgument) -> None:
     """Show version, license, platforms, capabilities and variables."""
-    from servobench.harness.apps.fmu.inspection import read_information, shape_of
+    from servobench.harness.apps.fmu.inspection import read_information
 
     with configuration_errors():
         information = read_information(file)
@@ -197,7 +197,7 @@ def info(file: FileArgument) -> None:
         say(f"capabilities in {name}: {', '.join(capabilities) or 'none'}")
     rows = []
     for each in described.modelVariables:
-        size = " × ".join(map(str, shape_of(each))) or "1"
+        size = " × ".join(map(str, each.shape)) or "1"
         start = str(each.start or "")
         start = start if len(start) <= 24 else f"{start[:23]}…"
         rows.append((each.name, each.causality or "local", size, each.unit or "", start))

@@ -87,18 +87,6 @@ def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
     return interfaces
 
 
-def shape_of(variable: Any) -> tuple[int, ...]:  # noqa: ANN401 - fmpy's classes carry no usable types
-    """Return the sizes of the axes of a variable, as they are at its start; an axis of unknown size is left out."""
-    sizes = []
-    for axis in variable.dimensions or ():
-        size = axis.start
-        if size is None:
-            size = getattr(axis.variable, "start", None)
-        if size is not None:
-            sizes.append(int(size))
-    return tuple(sizes)
-
-
 @dataclass(frozen=True)
 class Validation:
     """Result of the checks."""
