@@ -51,4 +51,4 @@ def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:
     if not share.any():
         return rows[..., before, :]
     after = np.minimum(before + 1, rows.shape[-2] - 1)
-    return np.asarray((1.0 - share) * rows[..., before, :] + share * rows[..., after, :])
+    return (1.0 - share) * rows[..., before, :] + share * rows[..., after, :]

@@ -5,13 +5,11 @@ equal models give equal bytes.
 """
 
 import math
-import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 
@@ -35,10 +33,9 @@ from servobench.fmus.variables import (
     Layout,
 )
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.facts import read_beside
 
-_TABLES = tomllib.loads(
-    Path(__file__).with_name("model_description.toml").read_text(encoding="utf-8")
-)
+_TABLES = read_beside(__file__, "model_description.toml")
 UNITS: dict[str, dict[str, str]] = _TABLES["units"]
 DISPLAY_UNITS: dict[str, str] = _TABLES["display_units"]
 ATTRIBUTES: dict[str, dict[str, str]] = _TABLES["roles"]

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, as_array
 
-# Indices of the factors in a cross product
+# IntArray of the factors in a cross product
 YZX = np.array([1, 2, 0])
 ZXY = np.array([2, 0, 1])
 
@@ -171,7 +171,7 @@ class SerialArm:
     def ball(self, frames: FloatArray) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for `frames`."""
         flange = frames[..., -1, :, :]
-        return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
+        return np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3]
 
 
 def plain_arm(

@@ -123,8 +123,7 @@ def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:
         return found
     if len(cameras) > 1:
         remark(f"{path.name}: the camera {cameras[0]} of {', '.join(cameras)} is taken")
-    chosen: dict[Any, Any] = found[cameras[0]]
-    return chosen
+    return found[cameras[0]]
 
 
 def _flat(found: dict[Any, Any]) -> dict[str, Any]:

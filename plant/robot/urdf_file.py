@@ -272,4 +272,4 @@ def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
         remark(
             f"link {link!r}: no body has the {came}, one above the others' sum; taken as {taken}"
         )
-    return np.asarray(axes * moments @ axes.T)
+    return axes * moments @ axes.T

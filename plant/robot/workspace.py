@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, IntArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm, freeze_arrays
-from servobench.plant.robot.camera import CAMERA, IntArray, PinholeCamera
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
 CENTRE = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
@@ -120,7 +120,7 @@ class Tubes:
     def placed(self, frames: FloatArray) -> FloatArray:
         """Return both ends of each tube in the base frame, (..., s, 2, 3) m, for frames (..., n+1, 4, 4)."""
         own = frames[..., self.link, None, :, :]
-        return np.asarray(np.matvec(own[..., :3, :3], self.ends) + own[..., :3, 3])
+        return np.matvec(own[..., :3, :3], self.ends) + own[..., :3, 3]
 
 
 def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
@@ -220,7 +220,7 @@ def collision_pairs(clearance: Clearance, postures: FloatArray) -> IntArray:
     placed = clearance.tubes.placed(clearance.arm.frames(postures))
     overlap_share = (clearance.gaps(placed, pairs) < 0.0).mean(axis=0)
     built_in = overlap_share > BUILT_IN_SHARE
-    return np.asarray(pairs[~built_in])
+    return pairs[~built_in]
 
 
 def segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -511,4 +511,4 @@ def _stretch(
     if not len(fit):
         fit = np.vstack([home, postures[clear(postures, singular=True)]])
     gain = clear.gain(clear.arm.frames(fit))
-    return np.asarray(fit[np.argmin(gain)])
+    return fit[np.argmin(gain)]

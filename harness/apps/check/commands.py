@@ -5,7 +5,6 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,7 @@ import typer
 from servobench.harness.cli.options import option, switch
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, write_atomically
+from servobench.plant.contract.files import accessing, write_text
 
 TEMPLATES = files("servobench.harness.apps.check") / "templates"
 PREFIX = "test_"
@@ -72,7 +71,7 @@ def new(
         for path, template in wanted.items():
             text = (TEMPLATES / f"{template}.py.txt").read_text(encoding="utf-8")
             text = text.replace("{{module}}", module).replace("{{Class}}", class_name)
-            write_atomically(path, partial(Path.write_text, data=text, encoding="utf-8"))
+            write_text(path, text)
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
     lines = [

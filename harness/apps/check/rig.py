@@ -74,11 +74,11 @@ class Rig(Plant):
 
     def feature(self, q: FloatArray) -> FloatArray:
         """Return the true feature (..., m) [m] at joint positions (..., n) [rad]."""
-        return np.asarray(np.matvec(self.A, q + BEND * q**3))
+        return np.matvec(self.A, q + BEND * q**3)
 
     def jacobian(self, q: FloatArray) -> FloatArray:
         """Return the true Jacobian (..., m, n) [m/rad] at joint positions (..., n) [rad]."""
-        return np.asarray(self.A * (1.0 + 3.0 * BEND * q**2)[..., None, :])
+        return self.A * (1.0 + 3.0 * BEND * q**2)[..., None, :]
 
     def model_jacobian(self, q: FloatArray) -> FloatArray:
         """Return the Jacobian of the nominal model, as `jacobian`."""

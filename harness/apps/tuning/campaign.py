@@ -53,7 +53,7 @@ from servobench.harness.config.installation import read_checkout
 from servobench.harness.config.registry import offered
 from servobench.harness.config.settings import default_config, file_stem, flatten
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, write_atomically
+from servobench.plant.contract.files import accessing, write_text
 from servobench.plant.contract.settings import Count, Periods, settings
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
@@ -337,7 +337,7 @@ def write_tuned(path: Path, tuned: TunedValues) -> None:
     for record in records:
         text += _table(record, "studies.", "\n[[studies]]\n")
     with accessing(path, "tuned values"):
-        write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+        write_text(path, text)
 
 
 def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
