@@ -251,6 +251,29 @@ class JointLimits:
             raise ValueError(f"joint_velocity_limit must be positive, got {self.speed.tolist()}")
 
 
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The moving links as rigid bodies and as shapes; row i is the link after joint i+1.
+
+    Masses lie in the frame at the link's far end, before the rotation of the next joint: DH frame i+1.
+    """
+
+    mass: FloatArray  # (n,) [kg]
+    centre: FloatArray  # (n, 3) [m], centre of mass
+    inertia: FloatArray  # about it [kg m²]: (n, 2), across the link and along it; or (n, 3, 3)
+    torque: FloatArray  # (n,) [Nm], largest of the joint
+    radius: FloatArray  # (n,) [m], radius of the link's tube
+    aside: FloatArray  # (n,) [m], offset of the tube from its joints, along the joint's axis
+    payload: float  # rated load [kg]
+
+    def __post_init__(self) -> None:
+        """Check the shapes and freeze the arrays."""
+        n = len(self.mass)
+        freeze_arrays(self, (n,), "mass", "torque", "radius", "aside")
+        freeze_arrays(self, (n, 3), "centre")
+        freeze_arrays(self, (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2), "inertia")
+
+
 def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float) -> JointLimits:
     """Return limits of `n` joints within a speed [rad/s], a distance from zero [rad] and, where given, others.
 
