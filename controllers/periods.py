@@ -5,7 +5,7 @@ import numpy as np
 from servobench.plant.contract.checks import FloatArray
 
 # [1] Relative distance to a whole number below which a number of periods is whole.
-_WHOLE: float = 1e-9
+_WHOLE = 1e-9
 
 
 def in_periods(time: float, period: float) -> float:

@@ -161,7 +161,7 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
 def _units(root: ET.Element, used: set[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     # A pixel, or any other unit of a set-up, is a number.
-    own: dict[str, dict[str, str]] = {}
+    own = {}
     for name in sorted(used - set(UNITS)):
         own[name] = {"rad": "-1"} if name.endswith("/rad") else {}
     for name, exponents in (UNITS | own).items():
@@ -261,5 +261,5 @@ def _dependencies(
 def xml_bytes(root: ET.Element) -> bytes:
     """Return the text of an XML file, one line for each element."""
     ET.indent(root)
-    text: str = ET.tostring(root, encoding="unicode")
+    text = ET.tostring(root, encoding="unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()

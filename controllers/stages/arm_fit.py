@@ -196,7 +196,7 @@ def added(
     frames = branch(frames.number >= most, _thinned, frames)
     here = np.arange(FRAMES) == frames.number[..., None]
     new = {"time": time, "feature": feature, "weight": valid.astype(np.float64), "path": path}
-    rows: dict[str, Any] = {}
+    rows = {}
     for name in ROWS:
         old: FloatArray = getattr(frames, name)
         mask = here.reshape(here.shape + (1,) * (old.ndim - here.ndim))

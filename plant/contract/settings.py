@@ -119,7 +119,7 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - as read from a file
 
 
 def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
-    number: Any = value
+    number = value
     if isinstance(value, str):
         parts = split_quantity(value)
         in_pixels = parts is not None and parts[1] == "px"

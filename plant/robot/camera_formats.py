@@ -175,7 +175,7 @@ def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
     if value is None:
         return []
     if isinstance(value, list):
-        cells: list[Any] = np.array(value, dtype=object).ravel().tolist()
+        cells = np.array(value, dtype=object).ravel().tolist()
         for cell in cells:
             if not isinstance(cell, int | float) or not isfinite(cell):
                 raise ValueError(f"a matrix must hold finite numbers, got {cell!r}")

@@ -99,7 +99,7 @@ def check(
     from servobench.harness.apps.check.controllers import check_controller
     from servobench.harness.apps.check.plants import check_plant
     from servobench.harness.apps.check.report import Finding
-    from servobench.harness.apps.check.trial import Checks, run_checks
+    from servobench.harness.apps.check.trial import run_checks
 
     if subject == ["plant"]:
         raise ConfigurationError(
@@ -110,8 +110,8 @@ def check(
         raise ConfigurationError(
             f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}"
         )
-    checks: Checks = check_plant if is_plant else check_controller
-    findings: list[Finding] = []
+    checks = check_plant if is_plant else check_controller
+    findings = []
 
     def hear(finding: Finding) -> None:
         findings.append(finding)

@@ -94,7 +94,7 @@ def draw_figures(folder: ResultsFolder) -> list[Path]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    paths: list[Path] = []
+    paths = []
     for named in folder_figures(folder):
         paths += save_figure(named.figure, folder.path / FOLDER / named.stem, ("png",))
     return paths

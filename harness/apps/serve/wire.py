@@ -99,7 +99,7 @@ class Recipe:
                 f"data of {self.names[0]} … must be {self.layout.size} bytes, got {len(body)}"
             )
         numbers = iter(self.layout.unpack(body))
-        values: dict[str, Any] = {}
+        values = {}
         for name, kind in zip(self.names, self.types, strict=True):
             size = len(ZEROS[kind])
             first, *others = islice(numbers, size)

@@ -73,7 +73,7 @@ def ranking(table: pd.DataFrame) -> list[Ranked]:
     tail = (1.0 - CONFIDENCE) / 2.0
     ends = drawn.quantile([tail, 1.0 - tail])
     apart = _told_apart(means, drawn)
-    found: list[Ranked] = []
+    found = []
     rank = 1
     best = str(means.index[0])  # of those with this rank
     for place, name in enumerate(map(str, means.index), start=1):

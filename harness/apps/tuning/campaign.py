@@ -138,7 +138,7 @@ class Method:
 
     def wanted(self) -> list[Wanted]:
         """Return the points that its studies ask for, after they went on as far as the ledger knows."""
-        wanted: list[Wanted] = []
+        wanted = []
         for each in self.studies:
             each.advance(self.ledger)
             if each.wanted is not None:
@@ -388,7 +388,7 @@ class Check:
         """
         self._runs = runs
         self._changes: list[tuple[Ledger, list[dict[str, Any]], partial[Change]]] = []
-        points: dict[str, Wanted] = {}
+        points = {}
         for name in controllers:
             config = default_config(find_tunable(name))
             Trial(name, config).build(runs.runs())

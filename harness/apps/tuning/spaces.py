@@ -285,8 +285,8 @@ def study(
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sampled = optuna.create_study(direction="minimize")
-    scores: list[float] = []
-    points: list[Point] = []
+    scores = []
+    points = []
     for number in range(trials):
         if number < len(first):
             sampled.enqueue_trial(dict(first[number]))

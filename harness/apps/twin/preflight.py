@@ -289,7 +289,7 @@ def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[
     if known:
         stages = [(_remedies, TIE_RATIO)]
     least = as_it_is
-    names: list[str] = []
+    names = []
     for remedies, gain in stages:
         fits = []
         for *_, remedy in nsmallest(SCREENED, _placed(remedies(log, model, others), rows)):
