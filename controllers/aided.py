@@ -14,8 +14,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, final
 
-import numpy as np
-
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import (
     Controller,
@@ -77,7 +75,7 @@ class OwnLaw(Law[None]):
 
     def _jacobian(self, joint_position: FloatArray) -> FloatArray:
         nominal: Any = self._nominal
-        return np.asarray(nominal(joint_position) + self._correction)
+        return nominal(joint_position) + self._correction
 
     def _in_plant_unit(self, observation: Observation) -> Observation:
         return observation.with_values(observation.joint_position, self._unit * observation.feature)

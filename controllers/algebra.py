@@ -52,7 +52,7 @@ def _decompose(_: FloatArray, J: FloatArray, damping: float) -> FloatArray:
     """Return (JJᵀ + δ²I)⁻¹ J, (..., m, n), from singular values."""
     U, sigma, Vt = np.linalg.svd(J, full_matrices=False)
     inverse = sigma / (sigma**2 + damping**2)
-    return np.asarray((U * inverse[..., None, :]) @ Vt)
+    return (U * inverse[..., None, :]) @ Vt
 
 
 def project_to_row_space(weights: FloatArray, jacobian: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from servobench.controllers.controller import (
     RobotKnowledge,
 )
 from servobench.controllers.laws.mpc import closed_form
-from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver, joint_bounds
+from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, joint_bounds
 from servobench.controllers.periods import check_preview, in_periods, sampled, whole_periods
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
@@ -59,8 +59,6 @@ class NmpcCalibratedConfig:
     """[rad/s²] limit between two commands; inf: none."""
     limit_position: bool = True
     """Keep predicted joint positions within the plant's limits."""
-    solver: Solver = "daqp"
-    """QP solver; "qpoases" for a cross-check."""
     fallback: Literal["hold", "raise"] = "hold"
     """Without a solution: zero velocity, or `SolverFailed`."""
 
@@ -137,7 +135,7 @@ class NmpcCalibrated(Controller):
             view_rows=np.zeros((0, m)),
             varying_jacobian=True,
         )
-        self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
+        self._program = QpProgram(self._shape, raises=config.fallback == "raise")
         # A turn of the camera is known to act on points, not on pixels.
         self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0
         self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
@@ -353,14 +351,13 @@ def _linearisation(symbolic: Any, n: int, m: int) -> Any:  # noqa: ANN401 - an e
     """
     import casadi  # noqa: PLC0415 - other methods start without it
 
-    create: Any = casadi.Function  # its annotations do not know MX
     q = casadi.MX.sym("joint_position", n)
     feature = symbolic(q)
     if feature.shape != (m, 1):
         raise ValueError(
             f"true_symbolic must give an expression of shape ({m}, 1), got {feature.shape}"
         )
-    function = create("linearisation", [q], [feature, casadi.jacobian(feature, q)])
+    function = casadi.Function("linearisation", [q], [feature, casadi.jacobian(feature, q)])
     try:
         return function.expand()
     # Foreign code, such as an FMU's, has no scalar operations; expanding only saves time.

@@ -5,7 +5,7 @@ import numpy as np
 from servobench.plant.contract.checks import FloatArray
 
 # [1] Relative distance to a whole number below which a number of periods is whole.
-_WHOLE: float = 1e-9
+_WHOLE = 1e-9
 
 
 def in_periods(time: float, period: float) -> float:
@@ -51,4 +51,4 @@ def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:
     if not share.any():
         return rows[..., before, :]
     after = np.minimum(before + 1, rows.shape[-2] - 1)
-    return np.asarray((1.0 - share) * rows[..., before, :] + share * rows[..., after, :])
+    return (1.0 - share) * rows[..., before, :] + share * rows[..., after, :]

@@ -149,7 +149,7 @@ class Servo:
         J = state.jacobian
         if state.calibration is not None:
             J = branch(state.calibration.used, self._arm_jacobian, J, state.calibration)
-        return np.asarray(self._unit * J)
+        return self._unit * J
 
     def _arm_jacobian(self, _: FloatArray, calibration: CalibrationState) -> FloatArray:
         """Return the Jacobian of the calibrated arm, (..., m, n), in lanes where it is believed."""

@@ -7,8 +7,6 @@ With s = 1 nothing is changed. Settings in metres are therefore metres of a ball
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
 
@@ -22,7 +20,7 @@ class NaturalJacobian:
 
     def __call__(self, joint_position: FloatArray) -> FloatArray:
         """Return J / s, (..., m, n)."""
-        return np.asarray(self.function(joint_position) / self.scale)
+        return self.function(joint_position) / self.scale
 
 
 def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:

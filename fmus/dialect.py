@@ -1,10 +1,9 @@
 """What differs between the versions of FMI in the files of an exported FMU: one row of facts for each version."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.fmu.dialect import FMI2, FMI3, FmiDialect
 
 # Parts of the model structure.
@@ -35,7 +34,7 @@ class ExportDialect:
     exchange: Mapping[str, str] = field(default_factory=dict)
 
 
-_TABLES = tomllib.loads(Path(__file__).with_name("dialect.toml").read_text(encoding="utf-8"))
+_TABLES = read_beside(__file__, "dialect.toml")
 EXPORTS = {names.version: ExportDialect(names, **_TABLES[names.prefix]) for names in (FMI2, FMI3)}
 
 

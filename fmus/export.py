@@ -136,7 +136,7 @@ def fingerprint(options: ExportOptions) -> str:
     and their numbers, and of a set-up that is not one of `plant.cameras` its equations.
     """
     view = options.view
-    parts: list[object] = [
+    parts = [
         exporter(),
         version("casadi"),
         version("fmpy"),

@@ -5,13 +5,11 @@ equal models give equal bytes.
 """
 
 import math
-import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 
@@ -35,10 +33,9 @@ from servobench.fmus.variables import (
     Layout,
 )
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.facts import read_beside
 
-_TABLES = tomllib.loads(
-    Path(__file__).with_name("model_description.toml").read_text(encoding="utf-8")
-)
+_TABLES = read_beside(__file__, "model_description.toml")
 UNITS: dict[str, dict[str, str]] = _TABLES["units"]
 DISPLAY_UNITS: dict[str, str] = _TABLES["display_units"]
 ATTRIBUTES: dict[str, dict[str, str]] = _TABLES["roles"]
@@ -164,7 +161,7 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
 def _units(root: ET.Element, used: set[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     # A pixel, or any other unit of a set-up, is a number.
-    own: dict[str, dict[str, str]] = {}
+    own = {}
     for name in sorted(used - set(UNITS)):
         own[name] = {"rad": "-1"} if name.endswith("/rad") else {}
     for name, exponents in (UNITS | own).items():
@@ -264,5 +261,5 @@ def _dependencies(
 def xml_bytes(root: ET.Element) -> bytes:
     """Return the text of an XML file, one line for each element."""
     ET.indent(root)
-    text: str = ET.tostring(root, encoding="unicode")
+    text = ET.tostring(root, encoding="unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()

@@ -73,16 +73,16 @@ def layout_header(
         token: GUID that the importer passes to `fmi2Instantiate` or `fmi3Instantiate…`.
     """
     groups = [f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups]
-    values: list[str] = []
+    values = []
     for group in layout.groups:
         group_values = np.resize(start.get(group.name, np.zeros(1)), group.size)
         values += [float(value).hex() for value in group_values]
-    minima: list[str] = []
+    minima = []
     for group in layout.of_role(PARAMETER, FIXED, INPUT, STATE):
         minimum = dict(group.attributes).get("min")
         bound = "-HUGE_VAL" if minimum is None else float(minimum).hex()
         minima += [bound] * group.size
-    macros: dict[str, object] = {
+    macros = {
         "TOKEN": f'"{token}"',
         "N_GROUPS": len(layout.groups),
         "N_VALUES": layout.size,

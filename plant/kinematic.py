@@ -14,11 +14,10 @@ from functools import lru_cache, partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup, World
-from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.checks import FloatArray, IntArray, is_finite
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds
@@ -240,7 +239,7 @@ class KinematicWorld(World):
         self._truth = None
         self.faults = {}
 
-    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+    def keep(self, lanes: IntArray) -> None:
         """See `Plant.keep`."""
         self.lead = (len(lanes),)
         self._first = take(self._first, lanes)

@@ -46,7 +46,7 @@ def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> Flo
     """Return |e|^(α−2) exp(−|e/β|^α), above 0, for normalised errors of any shape."""
     size = np.maximum(np.abs(error), MIN_ERROR)
     exponent = np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)
-    return np.asarray(size ** (shape - 2.0) * np.exp(-exponent))
+    return size ** (shape - 2.0) * np.exp(-exponent)
 
 
 def weighted_gain(
@@ -144,7 +144,7 @@ def fixed_point_update(
     tolerance times its norm; it begins at J⁻.
 
     Args:
-        J: J⁻; see `kalman.kalman_update`, as for the others up to `r`.
+        J: J⁻; see `kalman.split_update`, as for the others up to `r`.
         P: covariance of each row after the walk, (..., m, n, n).
         joint_step: Δq.
         feature_step: Δy.
@@ -248,7 +248,7 @@ def imcckf_update(
     r: FloatArray,
     bandwidth: float,
 ) -> Corrected:
-    """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
+    """Correct by one motion, with a P of each row; see `kalman.split_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     size = norm(innovation) / np.sqrt(r)
     weight = gaussian_weight(size, bandwidth)
@@ -292,7 +292,7 @@ def rmckf_update(
     r: FloatArray,
     config: RmckfConfig,
 ) -> Corrected:
-    """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
+    """Correct by one motion, with a P of each row; see `kalman.split_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     normalised = innovation / np.sqrt(r)[..., None]
     weight = gaussian_weight(normalised, config.bandwidth) + config.regularisation

@@ -55,8 +55,7 @@ class Estimator(ABC, Generic[State]):
         this.
         """
         one_matrix: Any = state
-        jacobian: FloatArray = one_matrix.J
-        return jacobian
+        return one_matrix.J
 
     def deviation(
         self, state: State, first: State | None, joint_position: FloatArray
@@ -83,8 +82,7 @@ class GatedEstimator(Estimator[State]):
         """Correct by one motion if it is large enough; see `Estimator.update`."""
         known: Any = state
         large = norm(motion.joint_step) >= self._config.min_joint_step
-        new: State = branch(large, self._correct, known._replace(updated=large), motion)
-        return new
+        return branch(large, self._correct, known._replace(updated=large), motion)
 
     @abstractmethod
     def _correct(self, state: State, motion: Motion) -> State:

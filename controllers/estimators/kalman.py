@@ -7,7 +7,7 @@ The Jacobian is a random walk that every motion measures. State x = vec(J) by ro
     Δy(k) = H x(k) + v,  H = I_m ⊗ Δqᵀ,  v ~ N(0, R),  R = 2σ² I  (Δy is the difference of two measurements)
 
 With P₀ = p₀ I, Q = q I and R = r I the filter splits into m filters of n states, one a feature, that share one
-covariance: the form "split", with the same numbers for a small part of the cost.
+covariance, with the same numbers for a small part of the cost: `split_update`, and "split" of the unscented filter.
 
 The unscented filter is that of methods 2 and 3 of the paper. Van der Merwe's scaled sigma points, 2s+1 of them for
 s = mn, with Λ = α²(s + κ) − s and L Lᵀ = P + Q:
@@ -68,9 +68,6 @@ class RandomWalk:
 class KalmanConfig(RandomWalk):
     """Settings of the Kalman filter."""
 
-    form: Literal["split", "full"] = "split"
-    """Same numbers; "full" is the readable reference."""
-
 
 def cholesky_of(P: FloatArray) -> FloatArray:
     """Return the lower Cholesky factor of covariances (..., s, s).
@@ -96,7 +93,7 @@ def cholesky_of(P: FloatArray) -> FloatArray:
 Corrected: TypeAlias = tuple[FloatArray, FloatArray]
 """Ĵ and its covariance after a motion."""
 Update: TypeAlias = Callable[..., Corrected]
-"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `kalman_update`; the
+"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `split_update`; the
 shape of P depends on the filter, see `Covariance`."""
 
 
@@ -109,50 +106,30 @@ def joseph(
     """
     A = P - outer(K, PH)
     column = r[..., None] * K - np.matvec(A, joint_step)
-    return np.asarray(A + outer(column, K))
+    return A + outer(column, K)
 
 
 def symmetric(P: FloatArray) -> FloatArray:
     """Return (P + Pᵀ)/2, (..., n, n): rounding leaves a covariance a little asymmetric."""
-    return np.asarray((P + P.mT) / 2)
+    return (P + P.mT) / 2
 
 
-def kalman_update(
+def split_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
 ) -> Corrected:
-    """Correct vec(J) by one motion, as printed: K = P Hᵀ (H P Hᵀ + R)⁻¹, covariance in Joseph form.
+    """Correct vec(J) by one motion, where its covariance is I_m ⊗ P: all rows of J share the gain K, (n,), and P.
+
+    K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
 
     Args:
         J: Jacobian, (..., m, n), m/rad.
-        P: covariance of vec(J) by rows after the walk, (..., mn, mn), (m/rad)².
+        P: covariance of each of its rows after the walk, (..., n, n), (m/rad)².
         joint_step: Δq, (..., n), rad.
         feature_step: Δy, (..., m), m.
         r: variance of Δy, (...), m².
 
     Returns:
         The new Jacobian and covariance.
-    """
-    *lead, m, n = J.shape
-    x = J.reshape(*lead, m * n)
-    blocks = np.eye(m)[..., None] * joint_step[..., None, None, :]
-    H = blocks.reshape(*lead, m, m * n)
-    R = r[..., None, None] * np.eye(m)
-    HP = H @ P
-    S = HP @ H.mT + R
-    K = np.linalg.solve(S, HP).mT
-    A = np.eye(m * n) - K @ H
-    P = A @ P @ A.mT + K @ R @ K.mT
-    nu = feature_step - np.matvec(H, x)
-    x = x + np.matvec(K, nu)
-    return x.reshape(J.shape), symmetric(P)
-
-
-def split_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
-) -> Corrected:
-    """Do the same where P = I_m ⊗ P_n: all rows of J share the gain K, (n,), and the covariance P_n, (..., n, n).
-
-    K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
     """
     PH = np.matvec(P, joint_step)
     K = PH / (np.vecdot(joint_step, PH) + r)[..., None]
@@ -228,9 +205,7 @@ def kalman_estimator(
 
     Nothing about the robot is needed.
     """
-    if config.form == "split":
-        return RandomWalkEstimator(config, split_update, "shared")
-    return RandomWalkEstimator(config, kalman_update, "full")
+    return RandomWalkEstimator(config, split_update, "shared")
 
 
 @settings
@@ -275,11 +250,11 @@ def unscented_update(
     r: FloatArray,
     config: UkfConfig,
 ) -> Corrected:
-    """Correct vec(J) by one motion with sigma points; see `kalman_update`.
+    """Correct vec(J) by one motion with sigma points; see `split_update`.
 
     Args:
         J: as there, like the others up to `r`.
-        P: after the walk.
+        P: covariance of vec(J) by rows after the walk, (..., mn, mn), (m/rad)².
         joint_step: Δq.
         feature_step: Δy.
         r: variance of Δy.
@@ -410,5 +385,4 @@ class RlsEstimator(GatedEstimator[WalkState]):
 
 def _mean_diagonal(P: FloatArray) -> FloatArray:
     """Return the mean of the diagonal of P, (...)."""
-    mean: FloatArray = P.trace(axis1=-2, axis2=-1) / P.shape[-1]
-    return mean
+    return P.trace(axis1=-2, axis2=-1) / P.shape[-1]

@@ -70,7 +70,7 @@ def projection_update(
     """
     square = np.vecdot(joint_step, joint_step)
     gain = step_factor * joint_step / (regularisation + square)[..., None]
-    return np.asarray(J + outer(feature_step - np.matvec(J, joint_step), gain))
+    return J + outer(feature_step - np.matvec(J, joint_step), gain)
 
 
 class ProjectionState(NamedTuple):

@@ -13,7 +13,7 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
@@ -37,7 +37,7 @@ class RbfConfig:
 def window_step(
     sizes: FloatArray,
     joint_steps: FloatArray,
-    count: npt.NDArray[np.int_],
+    count: IntArray,
     k2: float,
     epsilon: npt.ArrayLike,
 ) -> FloatArray:
@@ -67,7 +67,7 @@ class RbfState(NamedTuple):
     theta: FloatArray  # θ in the window, (..., T−1, U, L); 0 where a motion is still missing, as in the next two
     joint_steps: FloatArray  # Δq of the window, (..., T−1, n), rad
     feature_steps: FloatArray  # Δy of the window, (..., T−1, m), m
-    filled: npt.NDArray[np.int_]  # how many motions there are, (...)
+    filled: IntArray  # how many motions there are, (...)
     errors: FloatArray  # Δy_t − Ĵ_t Δq_t of the last update, (..., T, m), m
     step: FloatArray  # α₂ of the last update, (...)
 

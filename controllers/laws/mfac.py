@@ -43,7 +43,7 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
     """
     square = plus_diagonal(J @ J.mT, step_weight)
     solution = np.linalg.solve(square, e[..., None])[..., 0]
-    return np.asarray(step_factor * np.vecmat(solution, J))
+    return step_factor * np.vecmat(solution, J)
 
 
 @final

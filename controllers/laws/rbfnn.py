@@ -131,15 +131,13 @@ def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float)
     """Return α = k Σ‖e(k+t)‖² / (ε + ‖G‖²_F), (...), (eq. 23 with ε); 0 where there is nothing to descend."""
     wanted = k * sum_of_squares(ahead.errors, 2)
     size = epsilon + sum_of_squares(direction, 3)
-    quotient: FloatArray = wanted * (size > 0.0) / (size + (size == 0.0))
-    return quotient
+    return wanted * (size > 0.0) / (size + (size == 0.0))
 
 
 def sum_of_squares(array: FloatArray, axes: int) -> FloatArray:
     """Return the sum of squares over the last axes, (...)."""
     flat = array.reshape(*array.shape[:-axes], -1)
-    total: FloatArray = np.vecdot(flat, flat)
-    return total
+    return np.vecdot(flat, flat)
 
 
 @settings
@@ -311,7 +309,7 @@ class RbfnnLaw(Law[RbfnnState]):
         if not self._config.preview:
             return np.zeros((*reference.shape[:-2], horizon, self._network.m))
         rows = sampled(reference, self._preview_places)
-        return np.asarray(rows[..., 1:, :] - rows[..., :-1, :])
+        return rows[..., 1:, :] - rows[..., :-1, :]
 
     def _update(
         self, direction: FloatArray, ahead: RollOut, valid: bool | BoolArray

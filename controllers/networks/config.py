@@ -17,7 +17,6 @@ from servobench.plant.contract.settings import (
     settings,
 )
 
-Placement = Literal["halton", "sobol", "kmeans"]
 Grid: TypeAlias = Annotated[tuple[Positive, ...], Len(1)]
 Samples: TypeAlias = Annotated[int, Ge(10)]
 
@@ -30,8 +29,6 @@ class JacobianTraining:
     """[1] L, units per joint column."""
     samples: Samples = 4000
     """[1] joint positions, held-out ones included."""
-    placement: Placement = "halton"
-    """Where the centres lie."""
     width_scales: Grid = (0.7, 1.0, 1.5)
     """[1] δ over half the region's diagonal; the best is chosen."""
     regularisations: Grid = (1e-10, 1e-8, 1e-6)
@@ -71,8 +68,6 @@ class ControllerTraining:
     """[m] largest error per axis."""
     samples: Samples = 6000
     """[1] held-out ones included."""
-    placement: Placement = "halton"
-    """Where the centres lie."""
     width_scales: Grid = (2.0, 4.0, 8.0)
     """[1] reach of a unit over the spread of ξ; the best is chosen."""
     regularisations: Grid = (1e-12, 1e-10, 1e-8)

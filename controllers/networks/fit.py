@@ -30,8 +30,6 @@ from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks import rbf
 from servobench.controllers.networks.config import (
     ControllerTraining,
-    JacobianTraining,
-    Placement,
     TrainingConfig,
 )
 from servobench.controllers.networks.file import TrainedNetworks
@@ -45,48 +43,13 @@ DIGEST_POINTS = 16  # number of joint positions at which nominal models are comp
 DIGEST_DECIMALS = 9
 # Directions whose singular value is below this share of the largest one of J are left out.
 MIN_SINGULAR_SHARE = 0.1  # [1]
-CLUSTERING_POOL = 20  # number of samples per centre for k-means
 
 
-def unit_points(
-    count: int, dimension: int, rng: np.random.Generator, sequence: Placement = "halton"
-) -> FloatArray:
-    """Return scrambled low-discrepancy points of the unit cube, (count, dimension).
-
-    Args:
-        count: how many points.
-        dimension: of the cube.
-        rng: draws the scrambling.
-        sequence: "sobol" or "halton"; "kmeans" clusters Halton points.
-    """
+def unit_points(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    """Return points of a Halton sequence in the unit cube, (count, dimension), that `rng` scrambles."""
     from scipy.stats import qmc  # noqa: PLC0415 - a third of a second, when networks are trained alone
 
-    if sequence == "sobol":
-        exponent = int(np.ceil(np.log2(max(count, 2))))
-        return np.asarray(qmc.Sobol(dimension, seed=rng).random_base2(exponent)[:count])
-    return np.asarray(qmc.Halton(dimension, seed=rng).random(count))
-
-
-def choose_centres(
-    pool: FloatArray, count: int, rng: np.random.Generator, placement: Placement
-) -> FloatArray:
-    """Return `count` centres from a pool of low-discrepancy points (S, d): its first points, or its k-means.
-
-    A prefix of a low-discrepancy sequence is one itself, so no distance has to be computed.
-    """
-    if placement != "kmeans":
-        return pool[:count].copy()
-    from scipy.cluster.vq import kmeans2  # noqa: PLC0415 - when networks are trained alone, as above
-
-    centres, _ = kmeans2(pool, count, minit="++", seed=rng, missing="warn")
-    return np.asarray(centres, dtype=np.float64)
-
-
-def pool_size(count: int, placement: Placement) -> int:
-    """Return how many points `choose_centres` needs to place `count` centres."""
-    if placement == "kmeans":
-        return count * CLUSTERING_POOL
-    return count
+    return qmc.Halton(dimension, seed=rng).random(count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,13 +213,11 @@ def _train_jacobian(
     config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, report: Progress
 ) -> tuple[rbf.JacobianNetwork, float]:
     """Return the Jacobian network and its held-out error, the RMS of ‖Ĵ − J‖ over that of ‖J‖."""
-    plan: JacobianTraining = config.jacobian
+    plan = config.jacobian
     lower, upper = config.region(spec.n)
     rng = np.random.default_rng([config.seed, 1])
-    placement = plan.placement
-    unit = unit_points(plan.samples, spec.n, rng, placement)
-    pool = unit_points(pool_size(plan.centres, placement), spec.n, rng, placement)
-    centres = lower + (upper - lower) * choose_centres(pool, plan.centres, rng, placement)
+    unit = unit_points(plan.samples, spec.n, rng)
+    centres = lower + (upper - lower) * unit_points(plan.centres, spec.n, rng)
     q = lower + (upper - lower) * unit
     J = _checked(nominal_jacobian, q, spec)
     held = max(1, round(plan.samples * config.held_out))
@@ -288,17 +249,16 @@ def _train_controller(
     config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, report: Progress
 ) -> tuple[rbf.ControllerNetwork, float]:
     """Return the controller network and its held-out error, the RMS over joints of ψ ξ − q_cmd, rad."""
-    plan: ControllerTraining = config.controller
+    plan = config.controller
     dimension = controller_dimension(config, spec)
     rng = np.random.default_rng([config.seed, 2])
-    unit = unit_points(plan.samples, dimension, rng, plan.placement)
+    unit = unit_points(plan.samples, dimension, rng)
     samples = controller_samples(unit, config, spec, nominal_jacobian)
-    pool = unit_points(pool_size(plan.hidden, plan.placement), dimension, rng, plan.placement)
-    pool_xi = controller_samples(pool, config, spec, nominal_jacobian).xi
-    centres = choose_centres(pool_xi, plan.hidden, rng, plan.placement)
+    at_centres = unit_points(plan.hidden, dimension, rng)
+    centres = controller_samples(at_centres, config, spec, nominal_jacobian).xi
     wanted = samples.command
     held = max(1, round(plan.samples * config.held_out))
-    offsets = pool_xi - pool_xi.mean(axis=0)
+    offsets = centres - centres.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(offsets**2, axis=-1))))
     best = np.inf
     network = None

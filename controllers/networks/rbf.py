@@ -17,9 +17,8 @@ from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
@@ -46,7 +45,7 @@ def hidden_features(
     square = np.einsum("...p,...p->...", offset, offset)
     distance = square if kernel == "gaussian" else np.sqrt(square)
     exponent = distance / widths**2
-    return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
+    return np.exp(-np.minimum(exponent, MAX_EXPONENT))
 
 
 def _layer(
@@ -76,7 +75,7 @@ def controller_output(weights: FloatArray, xi: FloatArray, h: FloatArray) -> Flo
     """
     *lead, n, p, hidden = weights.shape
     psi = np.matvec(weights.reshape(*lead, n * p, hidden), h)
-    return np.asarray(np.matvec(psi.reshape(*psi.shape[:-1], n, p), xi))
+    return np.matvec(psi.reshape(*psi.shape[:-1], n, p), xi)
 
 
 def information_vector(errors: FloatArray, positions: FloatArray) -> FloatArray:
@@ -130,7 +129,7 @@ class JacobianNetwork:
         return self._members.shape[0], self.weights.shape[-1]
 
     @cached_property
-    def layer_of(self) -> npt.NDArray[np.int_]:
+    def layer_of(self) -> IntArray:
         """Index of the hidden layer of each column, (n,): columns of equal centres and widths share one."""
         layers: dict[bytes, int] = {}
         indices = []
@@ -180,7 +179,7 @@ class JacobianNetwork:
         factors = errors[..., None, :, None] * steps[..., None, :]
         flat = theta.reshape(*lead, count * layers, units)
         gradient = factors.reshape(*lead, count * layers, -1).mT @ flat
-        return np.asarray(gradient.reshape(*lead, self.m, self.n, units))
+        return gradient.reshape(*lead, self.m, self.n, units)
 
     def jacobian(self, q: FloatArray, rows: FloatArray | None = None) -> FloatArray:
         """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad, with the trained weights or with others."""
@@ -203,7 +202,7 @@ class JacobianNetwork:
         return np.asarray(self.layer_of == np.unique(self.layer_of)[:, None], dtype=np.float64)
 
     @cached_property
-    def _places(self) -> npt.NDArray[np.int_]:
+    def _places(self) -> IntArray:
         """Where the entries of Ĵ are among the products of all U layers with all columns, (m, n)."""
         entries = np.arange(self.m * self.n).reshape(self.m, self.n)
         return self.layer_of * self.m * self.n + entries

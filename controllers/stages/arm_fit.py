@@ -23,17 +23,14 @@ last ones, and of older ones a set that is thinned evenly.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.features import Derivatives, FeatureModel
 from servobench.plant.contract.lanes import branch, pick, plus_diagonal, where
 from servobench.plant.contract.signals import BoolArray
-
-IntArray: TypeAlias = npt.NDArray[np.int_]
 
 FRAMES = 160  # rows of the buffer
 KEPT = 96  # frames that are kept; all rows are used where frames are late, as each of them tells less then
@@ -199,7 +196,7 @@ def added(
     frames = branch(frames.number >= most, _thinned, frames)
     here = np.arange(FRAMES) == frames.number[..., None]
     new = {"time": time, "feature": feature, "weight": valid.astype(np.float64), "path": path}
-    rows: dict[str, Any] = {}
+    rows = {}
     for name in ROWS:
         old: FloatArray = getattr(frames, name)
         mask = here.reshape(here.shape + (1,) * (old.ndim - here.ndim))
@@ -263,7 +260,7 @@ def _whitened(
 def _along(by_joint: FloatArray, motion: FloatArray) -> FloatArray:
     """Return Σ_j ∂h/∂q_j v_j, (..., E, m, F), of derivatives (..., E, n, m, F) and motions (..., E, F, n)."""
     motion = np.swapaxes(motion, -1, -2)[..., None, :]
-    return np.asarray(np.add.reduce(by_joint * motion, axis=-3))
+    return np.add.reduce(by_joint * motion, axis=-3)
 
 
 def without_rates(fitted: Fitted) -> Fitted:
@@ -273,7 +270,7 @@ def without_rates(fitted: Fitted) -> Fitted:
 
 def squared(vectors: FloatArray) -> FloatArray:
     """Return ‖v‖², (..., F), of vectors (..., m, F)."""
-    return np.asarray(np.add.reduce(vectors * vectors, axis=-2))
+    return np.add.reduce(vectors * vectors, axis=-2)
 
 
 @final

@@ -31,7 +31,6 @@ from servobench.controllers.stages.arm_fit import (
     Fit,
     Fitted,
     Frames,
-    IntArray,
     Members,
     Trial,
     added,
@@ -44,7 +43,7 @@ from servobench.controllers.stages.arm_fit import (
 )
 from servobench.controllers.stages.pairing import MAX_LATENESS, rows_ago
 from servobench.controllers.stages.regression import MOVED_FRAMES
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.features import FeatureModel
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
@@ -414,7 +413,7 @@ class Calibration:
         expected = 3.0 * np.square(np.maximum(noise, 1e-4))[..., None] / count
         significance = np.vecdot(mean, mean) / expected
         kept = np.clip(1.0 - 2.0 / np.maximum(significance, 1e-9), 0.0, 1.0)
-        return np.asarray(mean * kept[..., None])
+        return mean * kept[..., None]
 
     def _lateness(
         self, state: CalibrationState, fitted: Fitted, best: IntArray, there: BoolArray
@@ -643,7 +642,7 @@ class Calibration:
 def _floor(noise: FloatArray) -> FloatArray:
     """Return the variance of residuals that are but noise, (..., 1)."""
     variance = np.square(noise) + FLOOR**2
-    return np.asarray(variance[..., None])
+    return variance[..., None]
 
 
 def _of(

@@ -179,12 +179,12 @@ class Estimation:
             return predicted
         own = np.matvec(state.own, joint_step)
         if self._model == "nominal":
-            return np.asarray(predicted + own)
+            return predicted + own
         if self._model == "own" or self.pairing is None:
             return np.asarray(own)
         regression = self.pairing.regression
         h = regression.regressors(begin + 0.5 * joint_step, joint_step, predicted)
-        return np.asarray(regression.explained(state.learned.pair.regression, h) + own)
+        return regression.explained(state.learned.pair.regression, h) + own
 
     def into_model_frame(self, state: EstimationState) -> FloatArray:
         """Return Rᵀ, (..., m, m), that turns measured features into those of the nominal cameras."""

@@ -29,8 +29,7 @@ REMAINDER_TOLERANCE = 1e-6  # [1] of the step that may be left undone
 
 def largest_excess(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     """Return the largest |u_i| / limit_i, (...), of joint velocities (..., n); above 1 some joint exceeds its limit."""
-    excess: FloatArray = np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1)
-    return excess
+    return np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1)
 
 
 def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
@@ -43,9 +42,7 @@ def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     Returns:
         (..., n), rad/s.
     """
-    return np.asarray(
-        joint_velocity / np.maximum(largest_excess(joint_velocity, limit), 1.0)[..., None]
-    )
+    return joint_velocity / np.maximum(largest_excess(joint_velocity, limit), 1.0)[..., None]
 
 
 class _Shared(NamedTuple):
@@ -100,8 +97,7 @@ def redistribute(
 
 def _is_unfinished(state: _Shared) -> BoolArray:
     enough = np.add.reduce(state.free, axis=-1) >= state.jacobian.shape[-2]
-    unfinished: BoolArray = (state.left > REMAINDER_TOLERANCE) & enough
-    return unfinished
+    return (state.left > REMAINDER_TOLERANCE) & enough
 
 
 def _take_over(state: _Shared, limit: FloatArray, damping: float) -> _Shared:
@@ -137,10 +133,7 @@ def step_with_posture(
         away: q_c − q, from the present joint position to the wanted posture, (..., n), rad.
         share: κ, of that distance; 0 for no posture.
     """
-    step: FloatArray = (
-        np.matvec(inverse, feature_step - share * np.matvec(jacobian, away)) + share * away
-    )
-    return step
+    return np.matvec(inverse, feature_step - share * np.matvec(jacobian, away)) + share * away
 
 
 @final

@@ -45,8 +45,7 @@ class NoiseLevel(NamedTuple):
     @property
     def deviation(self) -> FloatArray:
         """σ, (...), m."""
-        deviation: FloatArray = np.sqrt(self.variance)
-        return deviation
+        return np.sqrt(self.variance)
 
     def learn(
         self, square: FloatArray, count: FloatArray, multiple: FloatArray, other: FloatArray

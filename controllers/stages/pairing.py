@@ -41,7 +41,6 @@ from servobench.controllers.periods import in_periods, whole_periods
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.regression import (
     Innovation,
-    IntArray,
     Regression,
     RegressionState,
     fresh_bank,
@@ -49,7 +48,7 @@ from servobench.controllers.stages.regression import (
     learn,
     of_filter,
 )
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 

@@ -140,7 +140,7 @@ class JointResponse(NamedTuple):
     def flight(self) -> FloatArray:
         """Return the joint motion (..., n), rad, that is still to come of the commands so far."""
         last = self.commands[..., : self.left.shape[-1], :]
-        return np.asarray(np.vecmat(self.left, last))
+        return np.vecmat(self.left, last)
 
     def _steps(self) -> FloatArray:
         """Return the commanded steps of the windows that end 1 … N periods ago, (..., N, n), rad."""
@@ -353,4 +353,4 @@ def _interpolated(now: FloatArray, reference: FloatArray, lead: FloatArray) -> F
     s = np.maximum(s, 0.0)
     steps = reference[..., 1:, :] - reference[..., :-1, :]
     first = reference[..., :1, :]
-    return np.asarray(first + s @ steps)
+    return first + s @ steps

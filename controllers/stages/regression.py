@@ -33,19 +33,17 @@ All functions are pure; the axis of the filters follows the leading axes of runs
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.algebra import nearest_rotation
 from servobench.controllers.controller import RobotKnowledge
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import Tree, branch, map_arrays, outer, pick
 from servobench.plant.contract.signals import BoolArray
 
-IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE = 10.0  # [1] g, the largest ‖ν‖²/s; the excess is taken for noise of the frame
 # [1] Largest lead of one filter in −2 ln likelihood, so that another can come back after a change.
 LEAD_CAP = 100.0
@@ -314,7 +312,7 @@ class Regression:
         M = W[..., self._map]
         E = W[..., : self._n]
         H = W[..., self._n : self._map.start]
-        return np.asarray(M @ nominal + E + H @ self._quadratic(joint_position))
+        return M @ nominal + E + H @ self._quadratic(joint_position)
 
     def regressors(
         self, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
@@ -331,16 +329,16 @@ class Regression:
 
     def explained(self, state: RegressionState, h: FloatArray) -> FloatArray:
         """Return the motion Ĵ Δq, (..., m), of a joint motion with the regressors h."""
-        return np.asarray(np.matvec(state.mean[..., :-1], h))
+        return np.matvec(state.mean[..., :-1], h)
 
     def deviation(self, state: RegressionState) -> FloatArray:
         """Return Σ μ_b A_b, (...), m/rad: how far the arm seems to differ from its model."""
-        return np.asarray(np.vecdot(self.weights(state), DEVIATIONS))
+        return np.vecdot(self.weights(state), DEVIATIONS)
 
     def weights(self, state: RegressionState) -> FloatArray:
         """Return μ, (..., B)."""
         likelihood = np.exp(-0.5 * state.scores)
-        return np.asarray(likelihood / np.add.reduce(likelihood, axis=-1)[..., None])
+        return likelihood / np.add.reduce(likelihood, axis=-1)[..., None]
 
     def _quadratic(self, joint_position: FloatArray) -> FloatArray:
         """Return the derivatives of the products r_j r_k (j < k) and r_j²/2, (..., n (n+1)/2, n), at r = q − q_c."""

@@ -8,11 +8,9 @@ used wherever numpy wants numbers.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
 from itertools import count
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -34,6 +32,7 @@ from servobench.fmus.controllers.program import (
     numbers,
     operand,
 )
+from servobench.plant.contract.facts import read_beside
 
 DTYPES = {"b": np.dtype(np.bool_), "i": np.dtype(np.int_), "f": np.dtype(np.float64)}
 
@@ -199,7 +198,7 @@ class Traced(NDArrayOperatorsMixin):
             cut: Traced = np.where(self < 0.0, np.ceil(self), np.floor(self))  # type: ignore[assignment]
             return Traced(cut.buffer, cut.places, "i")
         if kind == "b" and self.kind != "b":
-            return self != 0.0  # type: ignore[no-any-return]
+            return self != 0.0
         return Traced(self.buffer, self.places, kind)
 
     def setflags(self, **flags: bool) -> None:
@@ -294,9 +293,7 @@ def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> 
     return Traced.of(computed(JOIN, operands, (first,), detail), arranged.shape, kind)
 
 
-_TABLES = tomllib.loads(
-    (files("servobench.fmus.controllers") / "ufuncs.toml").read_text(encoding="utf-8")
-)
+_TABLES = read_beside(__file__, "ufuncs.toml")
 ARITHMETIC: Mapping[str, str] = _TABLES["arithmetic"]
 COMPARISONS: Mapping[str, str] = _TABLES["comparisons"]
 LOGICAL_NAMES: Mapping[str, str] = _TABLES["logical_names"]

@@ -26,8 +26,7 @@ def note_fault(wrong: Any, code: int) -> None:  # noqa: ANN401 - an array of tru
 def is_finite(array: Any) -> bool:  # noqa: ANN401 - an array
     """Return that an array is finite; one that a program computes notes a fault."""
     if isinstance(array, Traced) and not array.constant:
-        wrong: Any = np.logical_not(np.isfinite(array))
-        note_fault(wrong, NOT_FINITE)
+        note_fault(np.logical_not(np.isfinite(array)), NOT_FINITE)
         return True
     return bool(np.isfinite(np.asarray(array)).all())
 

@@ -513,7 +513,7 @@ def has_effects(block: Block) -> bool:
 def steps_of(places: Places) -> tuple[int, ...] | None:
     """Return the step along each axis of a table of places, or None if its entries do not lie in rows."""
     first = places.reshape(-1)[0]
-    expected: Any = first
+    expected = first
     steps = []
     for axis, size in enumerate(places.shape):
         second = places.take(min(1, size - 1), axis).reshape(-1)[0]

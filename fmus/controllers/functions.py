@@ -154,8 +154,7 @@ def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     one = as_traced(a)
     other = as_traced(b)
     of_vectors = one.ndim == 1 and other.ndim == 1
-    product: Traced = np.vecdot(one, other) if of_vectors else np.matmul(one, other)
-    return product
+    return np.vecdot(one, other) if of_vectors else np.matmul(one, other)
 
 
 def _cross(a: Any, b: Any, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
@@ -208,8 +207,7 @@ def solve(A: Any, b: Any) -> Traced:  # noqa: ANN401 - anything array-like
         return solve(left, right[:, None])[..., 0]
     n, k = right.shape[-2:]
     solution = call("solve", n * k, left, right)
-    stack: Traced = solution.reshape((*solution.shape[:-1], n, k))
-    return stack
+    return solution.reshape((*solution.shape[:-1], n, k))
 
 
 def inverse(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
@@ -225,8 +223,7 @@ def cholesky(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
     # A pivot that is NaN is not positive, either.
     definite = elementwise("greater", factor[..., entries], 0.0)
     note_fault(elementwise("logical_not", definite), NOT_DEFINITE)
-    root: Traced = factor[..., :entries].reshape(table.shape)
-    return root
+    return factor[..., :entries].reshape(table.shape)
 
 
 def determinant(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
@@ -279,8 +276,7 @@ def pseudo_inverse(a: Any) -> Traced:  # noqa: ANN401 - anything array-like
     large = elementwise("greater", values, bound)
     divisors = choose(large, values, 1.0)
     inverted = choose(large, elementwise("divide", 1.0, divisors), 0.0)
-    result: Traced = np.matmul(Vh.mT, inverted[..., None] * U.mT)
-    return result
+    return np.matmul(Vh.mT, inverted[..., None] * U.mT)
 
 
 FUNCTIONS: Mapping[Any, Callable[..., Any]] = {

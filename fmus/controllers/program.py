@@ -15,7 +15,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-Places: TypeAlias = npt.NDArray[np.intp]
+from servobench.plant.contract.checks import IntArray
+
+Places: TypeAlias = IntArray
 
 NUMBERS = "numbers"  # detail: the numbers
 INPUT = "input"  # detail: name of the array of the caller

@@ -427,7 +427,7 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     are kept.
     """
     counted = []
-    curves: set[str] = set()
+    curves = set()
     for part in parts:
         counted.append(_count_outcomes(part))
         _, followed = split_tasks(part)
@@ -511,7 +511,7 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
     single = runs["plant"].nunique() * runs["mismatch"].nunique() == 1
     rows = []
     for name in ordered(runs["controller"]):
-        row: PageRow = {(WHICH, "controller"): name}
+        row = {(WHICH, "controller"): name}
         for words, place in places:
             where = words
             if single and place["task"].nunique() == 1 and len(places) > 1:
@@ -587,7 +587,7 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
     ):
         is_same = (runs["controller"] == controller) & (runs["plant"] == plant)
         first = own.iloc[0]
-        row: PageRow = {
+        row = {
             (WHICH, "controller"): str(controller),
             (WHICH, "plant"): str(plant),
             (WHICH, "ended by"): str(status),
@@ -603,7 +603,7 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row per run: identity, status, outcome and main metrics."""
     runs = in_handy_units(runs)
     named = runs.assign(outcome=outcomes(runs))
-    table: dict[tuple[str, str], list[str]] = {}
+    table = {}
     headings = varied_columns(runs.columns)
     for name in ("controller", "task", *_varied(runs)):
         heading, factor = headings.get(name, (name, 1.0))

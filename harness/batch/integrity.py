@@ -62,8 +62,8 @@ def examine(folder: ResultsFolder) -> Examination:
     """
     check_resumable(folder)
     refuse_links(folder.path)
-    findings: list[Finding] = []
-    manifest: Manifest = {}
+    findings = []
+    manifest = {}
     try:
         manifest = folder.manifest
     except OtherSchema:
@@ -201,7 +201,7 @@ def restore_manifest(folder: ResultsFolder, manifest: Manifest) -> str:
     names = [part_name(index, RUNS) for index in folder.part_indices()]
     if (path / RUNS).exists():
         names.append(RUNS)
-    owners: set[str] = set()
+    owners = set()
     for name in names:
         with contextlib.suppress(DamagedFile):  # which is made again in any case
             owners.add(tables.owner(path, name).partition("@")[0])

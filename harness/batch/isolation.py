@@ -172,8 +172,7 @@ class Pool:
         if not hasattr(self._own, "isolated"):
             self._own.isolated = IsolatedProcess(self._limits, self._modules)
             self._isolated.append(self._own.isolated)
-        answer: Answer = self._own.isolated.carry_out(task, hear)
-        return answer
+        return self._own.isolated.carry_out(task, hear)
 
 
 class IsolatedProcess:

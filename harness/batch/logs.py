@@ -34,6 +34,15 @@ RENAMED = {  # counts of control periods up to 0.2.0 -> times
     f"initial.{word}_periods": f"initial.{word}_time" for word in ("probe", "settle", "average")
 }
 
+# Settings up to 0.2.0 without which runs are as with these values
+RETIRED = {
+    "solver": "daqp",
+    "law.solver": "daqp",
+    "estimator.form": "split",
+    "training.jacobian.placement": "halton",
+    "training.controller.placement": "halton",
+}
+
 
 class UnevenRows(ConfigurationError):
     """Rows of a log that are missing, doubled or out of order."""
@@ -123,6 +132,8 @@ def _settings_of(request: RunRequest, manifest: Manifest, *, own: bool) -> Setti
     period = dict(request.varied).get("run.period", common)
     flat = {each: restored(told.get(each, {})) for each in read}
     for values in flat.values():
+        for old in [name for name, usual in RETIRED.items() if values.get(name) == usual]:
+            del values[old]
         for old in RENAMED.keys() & values.keys():
             values[RENAMED[old]] = period * values.pop(old)
     usual = plain(flatten(resolve_sections([request], Settings({"run": {"period": common}}))[name]))

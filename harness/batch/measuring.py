@@ -35,8 +35,8 @@ def add_metric(folder: ResultsFolder, place: str) -> str:
             raise ConfigurationError(f"{other}, and no steps of which it could be computed anew")
         remark(f"{other}: it is computed anew")
     folder.check_steps()
-    values: dict[str, float] = {}
-    faults: list[str] = []
+    values = {}
+    faults = []
 
     def hear(told: object) -> None:
         match told:

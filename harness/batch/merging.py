@@ -44,7 +44,7 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
     """
     opened = [ResultsFolder(folder) for folder in folders]
     manifest = opened[0].manifest
-    found: list[tuple[range, ResultsFolder]] = []
+    found = []
     runs = []
     for folder in opened:
         # Refuses a table of anything else, whose names are of files

@@ -320,7 +320,7 @@ class ResultsFolder:
 
     def unlisted(self) -> list[str]:
         """Return the names of the files that have no checksum, and of results folders within this one, with a `/`."""
-        names: list[str] = []
+        names = []
         for place, inside, files in os.walk(self.path):
             own = Path(place).relative_to(self.path)
             for each in list(inside):

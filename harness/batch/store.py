@@ -120,7 +120,7 @@ def put_together(folder: ResultsFolder, manifest: Manifest) -> int:
     if not folder.part_indices():
         folder.refuse_damaged([name for name in (RUNS, STEPS) if folder.expects(name)])
         raise ConfigurationError(f"{path} holds no finished run")
-    files: Files = {}
+    files = {}
     for kind in (STEPS, FAILURES, RUNS):
         names = folder.part_names(kind)
         folder.refuse_damaged(names)

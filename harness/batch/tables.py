@@ -92,7 +92,7 @@ def as_table(rows: Sequence[Row]) -> pa.Table:
             return made.cast(pa.float64())
         return made
 
-    empty: dict[str, Any] = dict.fromkeys(chain.from_iterable(rows))
+    empty = dict.fromkeys(chain.from_iterable(rows))
     columns = zip(*((empty | dict(row)).values() for row in rows), strict=True)
     return pa.table(dict(zip(empty, map(column, empty, columns), strict=True)))
 

@@ -62,7 +62,7 @@ def ending_when_decided(campaign: Campaign, question: Question) -> Campaign:
     cells, ends = in_looks(campaign.cells, question.seeds, question.looks)
 
     def goes_on(runs: pd.DataFrame) -> Callable[[RunRequest], bool]:
-        answers: list[Answer] = []
+        answers = []
         if not runs.empty:
             answers = decide_worlds(runs, question)
         return needed_after(answers, question)

@@ -14,7 +14,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import JsonOption
 from servobench.harness.cli.terminal import console, print_json, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, write_atomically
+from servobench.plant.contract.files import accessing, write_text
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word
@@ -141,7 +141,7 @@ def init(
     if file.exists():
         raise ConfigurationError(f"{file} exists already and is left as it is; name another file")
     with accessing(file):
-        write_atomically(file, lambda new: new.write_text(text, encoding="utf-8"))
+        write_text(file, text)
     say(f"{file}: {', '.join(sections)}")
 
 

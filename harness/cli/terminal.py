@@ -67,8 +67,8 @@ def ending_alike() -> Iterator[list[int]]:
     Yields:
         The signals that came.
     """
-    caught: list[int] = []
-    raised: list[weakref.ref[_Interrupt]] = []
+    caught = []
+    raised = []
     hook = sys.unraisablehook
 
     def interrupt(number: int, frame: FrameType | None) -> None:

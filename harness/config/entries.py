@@ -210,7 +210,7 @@ class Kind(Generic[Entry]):
             ConfigurationError: it cannot be used; says the remedy.
         """
         if isinstance(given, self.entry):
-            entry: Any = given
+            entry = given
             if isinstance(build := getattr(given, "build", None), type):
                 check_class(build)
         elif isinstance(given, type) and issubclass(given, self.bases):
@@ -279,7 +279,7 @@ def _checked_plant(entry: PlantEntry, place: str) -> PlantEntry:
         raise ConfigurationError(
             f"{place}: needs must be a tuple of names of modules, got {needs!r}"
         )
-    code: Any = entry.build
+    code = entry.build
     if isinstance(code, type) and issubclass(code, World):
         code = partial(on_bench, code, True)
     engine, config_for = (
@@ -535,7 +535,7 @@ def _guard_hint(module: ModuleType) -> str:
 
 def _members(kind: Kind[Any], module: ModuleType) -> dict[str, object]:
     """Return the objects of a kind that a module defines; classes that lack methods only if there are no others."""
-    found: dict[str, object] = {
+    found = {
         name: value
         for name, value in vars(module).items()
         if isinstance(value, kind.entry)

@@ -146,7 +146,7 @@ def blas_libraries() -> list[dict[str, Any]]:
     import numpy as np  # noqa: PLC0415 - the version is printed without it
     from threadpoolctl import threadpool_info  # noqa: PLC0415 - likewise
 
-    found: list[dict[str, Any]] = [
+    found = [
         {
             "name": each["internal_api"],
             "version": each["version"],

@@ -118,10 +118,9 @@ class Registry(Generic[Entry]):
         if made is not None:
             return made
         given = _OFFERED.get(name)
-        entry: Entry = (
+        return (
             given.entry if given is not None and given.word == self.kind.word else _load(self, name)
         )
-        return entry
 
     def choose(self, given: object) -> str:
         """Return the name of an entry by which it is found from now on.

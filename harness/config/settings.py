@@ -175,7 +175,7 @@ def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
         )
     # Three numbers or more, without brackets
     bare = text.count(",") > 1 and text.lstrip()[0] not in "[{'\""
-    value: Any = text.strip()  # a bare word is a string
+    value = text.strip()  # a bare word is a string
     if not is_file(value) or "#" not in value:  # which would begin a comment
         with contextlib.suppress(ValueError, RecursionError):
             value = parse_toml(f"value = [{text}]" if bare else f"value = {text}")["value"]

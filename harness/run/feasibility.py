@@ -152,4 +152,4 @@ def _room(mismatch: Mismatch, robot: Robot, points: FloatArray) -> FloatArray:
     turn = min(math.pi, mismatch.size("camera_rotation") + mismatch.size("camera_move"))
     chord = 2.0 * math.sin(turn / 2.0)  # [1] for a radius of 1
     radius = np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
-    return np.asarray(longer + chord * radius)
+    return longer + chord * radius

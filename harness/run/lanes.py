@@ -19,11 +19,9 @@ from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.lanes import Lanes, Tree, map_arrays, take
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
-
-LaneIndex = npt.NDArray[np.intp]
 
 
 class AllEnded(Exception):
@@ -60,7 +58,7 @@ class Ends:
         if not len(self.running):
             raise AllEnded
 
-    def left_of(self, lanes: LaneIndex) -> LaneIndex | None:
+    def left_of(self, lanes: IntArray) -> IntArray | None:
         """Return the places of the runs that are still under way among those that were, or None if all are."""
         if len(lanes) == len(self.running):
             return None
@@ -128,7 +126,7 @@ class ManyBenches(Plant):
         """See `Plant.close`."""
         self._bench.close()
 
-    def _leave(self) -> LaneIndex | None:
+    def _leave(self) -> IntArray | None:
         """Let runs that ended leave the bench; return which of its lanes stay, or None if all do."""
         stay = self._ends.left_of(self._mine)
         self._mine = self._ends.running
@@ -184,7 +182,7 @@ class ManyServos(Controller):
         self._jacobian = self._ends.spread(self._servo.jacobian(self._state), self._jacobian)
         return Command(self._u)
 
-    def _leave(self) -> LaneIndex | None:
+    def _leave(self) -> IntArray | None:
         """Let runs that ended leave the state; return which of its lanes stay, or None if all do."""
         stay = self._ends.left_of(self._mine)
         self._mine = self._ends.running
@@ -202,7 +200,7 @@ class ManyServos(Controller):
 
 
 def failing_lanes(
-    servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: LaneIndex
+    servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: IntArray
 ) -> list[tuple[int, Exception]]:
     """Return the lanes in which a step fails, each with its error as a single run, by halving."""
     error = _error_of_step(servo, state, given, lanes)

@@ -18,7 +18,7 @@ from servobench.harness.config.registry import DECLARED
 from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.harness.run.scenario import Span
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.lanes import norm
 
 SETTLING_SHARE = 0.05  # band as a share of the initial error
@@ -186,7 +186,7 @@ def move_times(steps: Steps, moves: Sequence[Span]) -> FloatArray:
 
 def log_error(error: FloatArray, band: float) -> FloatArray:
     """Return the mean over periods, (...), of log₁₀(e / 0.3 band), at least 0, of an error (..., k) [as the band]."""
-    return np.asarray(np.log10(np.maximum(error / (ERROR_FLOOR * band), 1.0)).mean(axis=-1))
+    return np.log10(np.maximum(error / (ERROR_FLOOR * band), 1.0)).mean(axis=-1)
 
 
 def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
@@ -210,10 +210,10 @@ def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
 def path_length(points: FloatArray) -> FloatArray:
     """Return the length, (...), of the path through `points`, (..., m, k) [their unit]."""
     steps = np.ascontiguousarray(np.diff(points, axis=-1).mT)
-    return np.asarray(norm(steps).sum(axis=-1))
+    return norm(steps).sum(axis=-1)
 
 
-def sign_switches(command: FloatArray, limit: FloatArray) -> npt.NDArray[np.int_]:
+def sign_switches(command: FloatArray, limit: FloatArray) -> IntArray:
     """Return how often joints are driven back and forth, summed over joints.
 
     A joint switches in a period whose command is large, that is at least `LARGE_COMMAND` of the limit, if its previous
@@ -231,7 +231,7 @@ def sign_switches(command: FloatArray, limit: FloatArray) -> npt.NDArray[np.int_
     for back in range(SWITCH_PERIODS, 0, -1):
         earlier = sign[..., :-back]
         before[..., back:] = np.where(earlier == 0.0, before[..., back:], earlier)
-    return np.asarray(np.count_nonzero(sign * before < 0.0, axis=(-2, -1)))
+    return np.count_nonzero(sign * before < 0.0, axis=(-2, -1))
 
 
 def final_rows(period: float) -> slice:
@@ -259,7 +259,7 @@ def _median_time(run: Judged, moves: slice) -> FloatArray:
 def _saturation(run: Judged) -> FloatArray:
     limit = run.steps.spec.joint_velocity_limit[:, None] * (1 - 1e-9)
     at_limit = np.abs(run.command) >= limit
-    return np.asarray(at_limit.any(axis=-2).mean(axis=-1))
+    return at_limit.any(axis=-2).mean(axis=-1)
 
 
 def _overruns(run: Judged) -> FloatArray:
@@ -277,7 +277,7 @@ def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def _peak(run: Judged, values: FloatArray) -> FloatArray:
     if values.size:
-        return np.asarray(np.abs(values).max(axis=(-2, -1)))
+        return np.abs(values).max(axis=(-2, -1))
     return run.same(np.nan)
 
 
@@ -285,7 +285,7 @@ def _rms(run: Judged, values: FloatArray) -> FloatArray:
     """Return the root mean square over the last axis; NaN where it is empty."""
     if not values.shape[-1]:
         return run.same(np.nan)
-    return np.asarray(np.sqrt(np.mean(values**2, axis=-1)))
+    return np.sqrt(np.mean(values**2, axis=-1))
 
 
 def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatArray:

@@ -254,7 +254,7 @@ class FollowedCurve(ImageReference):
         curve = self._in_camera(time)
         place = np.matvec(pose[:3, :3], curve) + pose[:3, 3]
         about_middle = home - home.mean(axis=-2)
-        return np.asarray(place[..., None, :] + about_middle)
+        return place[..., None, :] + about_middle
 
     def _in_camera(self, time: npt.ArrayLike) -> FloatArray:
         """Return the curve in the frame of the camera, (..., 3) m, no larger than it fits into a user's image."""

@@ -18,7 +18,6 @@ from servobench.harness.run.variations import (
     SHORT_NAMES,
     Value,
     Varied,
-    as_tuples,
     words_in_name,
 )
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
@@ -31,6 +30,7 @@ from servobench.plant.contract.settings import (
     Usual,
     native,
     settings,
+    with_tuples,
 )
 from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, WITH, short_name
@@ -105,7 +105,7 @@ class RunRequest:
 
     def _in_order(self, varied: Mapping[str, Value]) -> Varied:
         """Return varied settings by role, those with short names first, so that equal runs are equal values."""
-        by_role = {self._by_role(key): as_tuples(value) for key, value in varied.items()}
+        by_role = {self._by_role(key): with_tuples(value) for key, value in varied.items()}
         if len(by_role) < len(varied):
             raise ConfigurationError(f"a setting is varied twice in {', '.join(varied)}")
         for short in SHORT_NAMES.values():  # their columns hold numbers

@@ -136,7 +136,7 @@ def resolve_sections(
     plants, controllers, tasks = (
         dict.fromkeys(getattr(each, role) for each in requests) for role in ROLES
     )
-    defaults: dict[str, Any] = {"run": RunSettings()}
+    defaults = {"run": RunSettings()}
     defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
     defaults |= {
         name: default_config(registry.find_controller(name), model_known=robot.known)
@@ -186,7 +186,7 @@ def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # no
         raise ConfigurationError(
             f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply"
         )
-    config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)
+    config = entry.config() if entry.config_for is None else entry.config_for(robot)
     with configuration_errors():
         if camera is not None:
             config = replace(config, sensing=camera.sensing(config.sensing, period))

@@ -68,10 +68,3 @@ def words_in_name(varied: tuple[str, Value]) -> str:
                 return ""
             return f"-{name}{short.scale * value:.12g}{short.unit}"
     return f"-{key}={value}"
-
-
-def as_tuples(value: Value | list[Value]) -> Value:
-    """Return a value with tuples for lists and tuples, at any depth."""
-    if isinstance(value, list | tuple):
-        return tuple(map(as_tuples, value))
-    return value

@@ -23,11 +23,10 @@ from itertools import count
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel, World
 from servobench.plant.bench.sensor import TIME_TOLERANCE, Sensor
-from servobench.plant.contract.checks import FloatArray, check_number, fewest_parts
+from servobench.plant.contract.checks import FloatArray, IntArray, check_number, fewest_parts
 from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.lanes import take
 from servobench.plant.contract.seeds import Seeds
@@ -443,7 +442,7 @@ class Bench(Plant):
         """See `Plant.faults`."""
         return self.world.faults
 
-    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+    def keep(self, lanes: IntArray) -> None:
         """See `Plant.keep`."""
         if not self.world.lead:
             super().keep(lanes)

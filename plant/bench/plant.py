@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, IntArray, as_array
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
@@ -117,7 +117,7 @@ class Abilities(ABC):
             "move_camera(self, X_BC) in its class"
         )
 
-    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+    def keep(self, lanes: IntArray) -> None:
         """Keep only some of the runs side by side and drop the others permanently.
 
         Args:

@@ -24,9 +24,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
 from servobench.plant.contract.sensing import (
@@ -159,7 +158,7 @@ class Sensor:
         self._due = np.maximum(self._due, due)
         return self._due
 
-    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+    def keep(self, lanes: IntArray) -> None:
         """Drop all other lanes."""
         for part in vars(self).values():
             if isinstance(part, Stream):
@@ -183,7 +182,7 @@ def begin_probability(share: float, frames: int) -> float:
 class Spell(NamedTuple):
     """The state of the spells of each lane."""
 
-    left: npt.NDArray[np.int_]  # (...), frames of the present spell that are left after this one
+    left: IntArray  # (...), frames of the present spell that are left after this one
     inside: BoolArray  # (...), whether the present frame is in a spell
     value: FloatArray  # (..., *), drawn for the present spell, or for the last one
 

@@ -116,7 +116,7 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
     k = optics.distortion[..., None, None, None]
     square = np.vecdot(a, a)[..., None, None]
     rate_b = rate_a + k * (square * rate_a + 2.0 * (outer(a, a) @ rate_a))
-    return np.asarray(optics.focal[..., None, None, None] * rate_b)
+    return optics.focal[..., None, None, None] * rate_b
 
 
 def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
@@ -307,5 +307,4 @@ def _depth(points: FloatArray) -> FloatArray:
         return np.maximum(depth, NEAR)
     # Expressions have methods in place of numpy's functions.
     clip_expression = np.frompyfunc(lambda z: z.fmax(NEAR), 1, 1)
-    clipped: FloatArray = clip_expression(depth)
-    return clipped
+    return clip_expression(depth)

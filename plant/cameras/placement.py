@@ -275,7 +275,7 @@ def _target_shape(setup: SensingSetup, robot: Robot) -> FloatArray:
     own = robot.camera
     if own is None or own.keys.target.side is None:
         return robot.workspace.scale * points
-    return np.asarray(points * (own.keys.target.side / max(np.ptp(points), 1e-9)))
+    return points * (own.keys.target.side / max(np.ptp(points), 1e-9))
 
 
 def _target_on_flange(

@@ -139,7 +139,7 @@ def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
     with configuration_errors(
         f"sensing {setup.name} has no symbolic twin: ", TypeError, AttributeError, RuntimeError
     ):
-        made: Any = setup.measure(points, optics)
+        made = setup.measure(points, optics)
     return casadi.vertcat(*made[0].tolist())
 
 

@@ -221,7 +221,7 @@ def _remove(entry: Path) -> None:
 def _prune(kind: Path) -> None:
     """Remove entries that were not used for long, and unfinished ones of processes that were killed."""
     now = time.time()
-    ages: dict[Path, float] = {}
+    ages = {}
     for path in kind.iterdir():
         with contextlib.suppress(OSError):
             ages[path] = now - path.stat().st_mtime

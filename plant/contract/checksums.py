@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from servobench.plant.contract.files import partial_path, sync, write_atomically
+from servobench.plant.contract.files import partial_path, sync, write_text
 
 SUMS = "SHA256SUMS"
 # Within the folder
@@ -64,7 +64,7 @@ def append_sums(folder: Path, digests: Mapping[str, str]) -> None:
 def keep_sums(folder: Path, sums: Sums) -> None:
     """Write the file anew with these lines only."""
     kept = [f"{each}  {name}\n" for name, digests in sums.items() for each in sorted(digests)]
-    write_atomically(folder / SUMS, lambda file: file.write_text("".join(kept), encoding="utf-8"))
+    write_text(folder / SUMS, "".join(kept))
 
 
 def read_sums(folder: Path) -> Sums | None:

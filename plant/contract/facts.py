@@ -1,4 +1,4 @@
-"""Facts that the package keeps as TOML files: arms, elements of URDF, and names of calibration tools."""
+"""Facts that the package keeps as TOML files, among its data or beside the module that needs them."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -8,6 +8,11 @@ from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import with_tuples
 
 DATA = Path(str(files("servobench.plant") / "data"))
+
+
+def read_beside(module: str, name: str) -> dict[str, Any]:
+    """Return the content of a TOML file that lies beside a module, given the module's `__file__`."""
+    return read_toml("facts", Path(module).with_name(name))
 
 
 def read_facts(name: str) -> Any:  # noqa: ANN401 - as the file has them

@@ -66,6 +66,11 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             partial.unlink()
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8, atomically."""
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+
+
 @contextmanager
 def writing_together(folder: Path) -> Iterator[Path]:
     """Yield a new folder for files that belong together; they get their places in `folder` once all of them are there.
@@ -290,7 +295,7 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
         if np.isfinite(values[row, column]):
             wanted = f"a number below {MAX_NUMBER:g}"
         raise ConfigurationError(f"{what}, row {row}: {names[column]} must be {wanted}, got {came}")
-    return np.asarray(values)
+    return values
 
 
 def harmless(text: str) -> str:

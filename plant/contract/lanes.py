@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 
 Tree = TypeVar("Tree")
 Lanes = Any  # an index of the leading axes
@@ -116,7 +116,7 @@ def repeat(
     return tree
 
 
-def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:
+def pick(array: npt.NDArray[Any], index: IntArray, axes: int = 0) -> npt.NDArray[Any]:
     """Return the entries at one index for each lane, along the first axis after the leading ones.
 
     Args:
@@ -129,8 +129,7 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
     """
     leading = np.ndim(index) - axes
     if leading == 0:
-        entry: npt.NDArray[Any] = array[index]
-        return entry
+        return array[index]
     lead, (length, *rest) = array.shape[:leading], array.shape[leading:]
     first = length * np.arange(math.prod(lead)).reshape(lead + (1,) * axes)
     return np.asarray(array.reshape(-1, *rest).take(first + index, axis=0))
@@ -146,7 +145,7 @@ def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArr
 
 def outer(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return a bᵀ, (..., m, n), for a (..., m) and b (..., n)."""
-    return np.asarray(np.einsum("...i,...j->...ij", a, b))  # a third faster than a product of views
+    return np.einsum("...i,...j->...ij", a, b)  # a third faster than a product of views
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
@@ -164,19 +163,18 @@ def _reflected(R: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray
     """Return the product with the sign of the smallest singular value changed, so that the determinant is 1."""
     signs = np.ones(R.shape[-1])
     signs[-1] = -1.0
-    return np.asarray((left * signs) @ right)
+    return (left * signs) @ right
 
 
 def norm(x: FloatArray) -> FloatArray:
     """Return ‖x‖, (...), for x (..., n)."""
-    length: FloatArray = np.sqrt(np.vecdot(x, x))
-    return length
+    return np.sqrt(np.vecdot(x, x))
 
 
 def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:
     """Return A + diag(value), (..., n, n), for A (..., n, n) and one number, (n,) or (..., n)."""
     rows = value if isinstance(value, float) else np.atleast_1d(value)[..., None, :]
-    return np.asarray(A + _identity(A.shape[-1]) * rows)
+    return A + _identity(A.shape[-1]) * rows
 
 
 @cache
@@ -194,5 +192,4 @@ def one_thread() -> AbstractContextManager[object]:
     modules = len(sys.modules)
     if not _found or _found[0][0] != modules:
         _found[:] = [(modules, ThreadpoolController())]
-    context: AbstractContextManager[object] = _found[0][1].limit(limits=1)
-    return context
+    return _found[0][1].limit(limits=1)

@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 
 Seeds: TypeAlias = int | Sequence[int]
 """The seed of a single run, or one for each of the runs side by side."""
@@ -99,10 +98,9 @@ class Stream:
             self._block = self._factor * (drawn[0] if self._single else np.stack(drawn, axis=1))
             self._used = 0
         self._used += 1
-        row: FloatArray = self._block[self._used - 1]
-        return row
+        return self._block[self._used - 1]
 
-    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+    def keep(self, lanes: IntArray) -> None:
         """Drop the streams of all other lanes."""
         self._seeds = [self._seeds[lane] for lane in lanes]
         if self._generators:

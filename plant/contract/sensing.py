@@ -288,12 +288,12 @@ def stable(
         logarithm = np.log(math.pi / 2.0 * W * np.cos(V) / slope)
         Z = slope * np.tan(V) - b * logarithm
         # In this parametrisation a scale γ shifts the numbers as well, by 2/π β γ ln γ.
-        return np.asarray(gamma * 2.0 / math.pi * (Z + b * math.log(gamma)))
+        return gamma * 2.0 / math.pi * (Z + b * math.log(gamma))
     theta = math.atan(b * math.tan(math.pi * a / 2.0)) / a
     turned = a * (V + theta)
     first = np.sin(turned) / (math.cos(a * theta) * np.cos(V)) ** (1.0 / a)
     second = np.maximum(np.cos(V - turned), TINY) / W
-    return np.asarray(gamma * first * second ** ((1.0 - a) / a))
+    return gamma * first * second ** ((1.0 - a) / a)
 
 
 def uniform(generator: np.random.Generator, shape: Shape) -> FloatArray:
@@ -319,10 +319,10 @@ def family_of(config: SensingConfig, extents: Extents) -> Draw:
 
 def quantise(feature: FloatArray, quantum: float) -> FloatArray:
     """Return a feature rounded to the nearest multiple of a quantum, both in its unit; half goes to the even one."""
-    return np.asarray(np.rint(feature / quantum) * quantum)
+    return np.rint(feature / quantum) * quantum
 
 
 def draw_directions(generator: np.random.Generator, shape: Shape) -> FloatArray:
     """Return unit vectors, (..., m), of directions that are uniform on the sphere."""
     x = generator.standard_normal(shape)
-    return np.asarray(x / np.sqrt(np.vecdot(x, x))[..., None])
+    return x / np.sqrt(np.vecdot(x, x))[..., None]

@@ -119,7 +119,7 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - as read from a file
 
 
 def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
-    number: Any = value
+    number = value
     if isinstance(value, str):
         parts = split_quantity(value)
         in_pixels = parts is not None and parts[1] == "px"
@@ -211,8 +211,7 @@ def settings(kind: Class) -> Class:
             raise ValueError(describe(error)) from None
 
     checked.__init__ = construct_checked
-    result: Class = checked
-    return result
+    return checked
 
 
 def nested(kind: type[Any]) -> Any:  # noqa: ANN401 - the default of a field of any settings class
@@ -299,11 +298,11 @@ def _suggest_setting(key: str, section: object) -> str:
 
 
 def with_tuples(value: Any) -> Any:  # noqa: ANN401 - any value of TOML
-    """Return a value with tuples for lists, at any depth."""
+    """Return a value with tuples for lists, at any depth, also in tuples."""
     if isinstance(value, dict):
         return {key: with_tuples(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return tuple(with_tuples(each) for each in value)
+    if isinstance(value, list | tuple):
+        return tuple(map(with_tuples, value))
     return value
 
 
@@ -379,8 +378,7 @@ def _stored_strings() -> dict[str, dict[str, str]]:
 
     `make tables` stores them.
     """
-    stored: dict[str, dict[str, str]] = json.loads(STORED_STRINGS.read_text(encoding="utf-8"))
-    return stored
+    return json.loads(STORED_STRINGS.read_text(encoding="utf-8"))
 
 
 def check_field(name: str, kind: type[Any], key: str, given: object) -> Any:  # noqa: ANN401 - any setting

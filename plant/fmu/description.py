@@ -294,7 +294,7 @@ def _unit(variable: Any, units: Mapping[str, Any]) -> str:  # noqa: ANN401 - as 
     """Return the usual name of a unit of length, angle or speed, or such as `0.1 × rad`; else the unit's own name."""
     kind = variable.declaredType
     name = variable.unit or getattr(kind, "unit", None) or ""
-    base: Any = units.get(name)
+    base = units.get(name)
     if base is None:
         return str(name)
     exponents = tuple(getattr(base, each) for each in BASES)

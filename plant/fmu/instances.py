@@ -162,7 +162,7 @@ class Instance2(Instance):
         interface = MODEL_EXCHANGE if description.exchange else CO_SIMULATION
         resources = (plain_root(description.root) / "resources").as_uri()
         invisible = 0
-        address: int | None = create(
+        return create(
             description.model_name.encode(),
             interface,
             description.token.encode(),
@@ -171,7 +171,6 @@ class Instance2(Instance):
             invisible,
             int(self._debugs),
         )
-        return address
 
     def _enter_initialisation(self, *experiment: Any) -> None:  # noqa: ANN401 - types of C
         self.call("SetupExperiment", *experiment)
@@ -274,8 +273,7 @@ class Instance3(Instance):
         # Without event mode and intermediate updates; steps may return early.
         steps = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]
         arguments = [*common, *messages] if exchange else [*common, *steps, *messages, null]
-        address: int | None = create(*arguments)
-        return address
+        return create(*arguments)
 
     def _enter_initialisation(self, *experiment: Any) -> None:  # noqa: ANN401 - types of C
         self.call("EnterInitializationMode", *experiment)

@@ -194,8 +194,7 @@ def read_mapping(kind: type[Roles], path: Path) -> Roles:
     mapping: Any = override(f"mapping {path}", kind(**placeholders), table)
     folder = path.parent
     log = None if mapping.debug_log is None else folder.absolute() / mapping.debug_log
-    made: Roles = replace(mapping, file=folder / mapping.file, debug_log=log)
-    return made
+    return replace(mapping, file=folder / mapping.file, debug_log=log)
 
 
 def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float) -> PlantSpec:

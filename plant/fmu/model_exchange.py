@@ -50,7 +50,7 @@ class FmuModel:
         root = extract_fmu(path)
         read_exchange(path, root)
         self._feature = _feature_function(path, root, joints, features, parameters)
-        q: Any = casadi.MX.sym("joint_position", self._feature.size1_in(0))
+        q = casadi.MX.sym("joint_position", self._feature.size1_in(0))
         y = self._feature(q)
         outputs = [y, casadi.jacobian(y, q)]
         self.function = casadi.Function(
@@ -88,7 +88,7 @@ def build_model(
         raise ValueError(
             "truth.states must name the states of the FMU that are the joint positions, got none"
         )
-    values: dict[str, float] = {}
+    values = {}
     for name, value in {**mapping.parameters, **(parameters or {})}.items():
         role = "nominal" if parameters and name in parameters else "parameters"
         variables = description.find(name, role, None)
@@ -137,7 +137,7 @@ def _feature_function(
         # The other lines name places in CasADi's code.
         reason = str(error).strip().splitlines()[-1]
         raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
-    q: Any = casadi.MX.sym("joint_position", len(joints))
+    q = casadi.MX.sym("joint_position", len(joints))
     place = {name: i for i, name in enumerate(joints)}
     rest = dict(zip(states, _starts(builder, states), strict=True))
     x = casadi.vertcat(*(q[place[name]] if name in place else rest[name] for name in states))

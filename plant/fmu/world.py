@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup, TrueModel, World
-from servobench.plant.contract.checks import FloatArray, as_array, is_finite, whole_steps
+from servobench.plant.contract.checks import FloatArray, IntArray, as_array, is_finite, whole_steps
 from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
@@ -356,7 +356,7 @@ class FmuWorld(World):
             return None
         return self._nominal.jacobian
 
-    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+    def keep(self, lanes: IntArray) -> None:
         """Close the instances of all other lanes; see `Plant.keep`."""
         chosen = lanes.tolist()
         self._instances.keep(chosen)

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
-from servobench.plant.robot.camera import IntArray, PinholeCamera
+from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.robot.camera import PinholeCamera
 
 ByteArray = npt.NDArray[np.uint8]
 HueRange: TypeAlias = tuple[tuple[int, int, int], tuple[int, int, int]]

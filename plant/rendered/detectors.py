@@ -183,7 +183,7 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
     tangents = planned.rays(columns.ravel(), rows.ravel())[:, :2]
     pixels = half + planned.focal * tangents
     points = locate(pixels[None], np.ones((1, 1)), optics)
-    return np.asarray(points[0])
+    return points[0]
 
 
 @final
@@ -504,7 +504,7 @@ def camera_poses(model: SetupModel, q: FloatArray) -> FloatArray:
     if model.mount == "fixed":
         return model.cameras
     flange = model.arm.frames(q)[-1]
-    return np.asarray(flange @ model.cameras)
+    return flange @ model.cameras
 
 
 def depth_deviation(
@@ -515,9 +515,9 @@ def depth_deviation(
     if config.depth_noise == "stereo":
         native_focal = camera.focal * config.native_width / camera.width
         slope = config.depth_subpixel / (native_focal * config.depth_baseline)  # [1/m]
-        return np.asarray(z**2 * slope)
+        return z**2 * slope
     if config.depth_noise == "structured_light":
-        return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2)
+        return 0.0012 + 0.0019 * (z - 0.4) ** 2
     return np.zeros_like(z)
 
 
@@ -559,7 +559,7 @@ def _unit_noise(side: float, shape: tuple[int, int], generator: np.random.Genera
     white = generator.standard_normal((height + 2 * margin, width + 2 * margin))
     by_rows = convolve1d(white, kernel, axis=0)
     smooth = convolve1d(by_rows, kernel, axis=1)
-    return np.asarray(smooth[margin : margin + height, margin : margin + width])
+    return smooth[margin : margin + height, margin : margin + width]
 
 
 @cache
@@ -570,4 +570,4 @@ def _patch_kernel(side: float) -> FloatArray:
     pixels = np.arange(-reach, reach + 1)
     standardised = pixels / max(deviation, 1e-9)
     weights = np.exp(-0.5 * standardised**2)
-    return np.asarray(weights / np.sqrt(weights @ weights))
+    return weights / np.sqrt(weights @ weights)

@@ -22,9 +22,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, Patch, largest_patch
-from servobench.plant.robot.camera import IntArray, PinholeCamera
+from servobench.plant.robot.camera import PinholeCamera
 
 Colour = tuple[float, float, float, float]  # red, green, blue and opacity, each up to 1
 RED = (0.90, 0.06, 0.05, 1.0)  # paint of the ball

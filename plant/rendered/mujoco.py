@@ -60,7 +60,7 @@ SHOWN_GROUP = 0
 HIDDEN_GROUP = 5
 COSTLY_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
 # [s] The time constant of stops and friction is the shortest that MuJoCo integrates well.
-CONSTRAINT_TIME: float = 2.0 * PHYSICS_STEP
+CONSTRAINT_TIME = 2.0 * PHYSICS_STEP
 # MuJoCo would leave out shapes that are only drawn, and join bodies that do not move against each other.
 KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="false" strippath="true"/></mujoco>'
 

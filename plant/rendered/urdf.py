@@ -14,11 +14,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.rendered.marks import RED, Colour
 from servobench.plant.rendered.settings import Box
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
-from servobench.plant.robot.camera import IntArray
 from servobench.plant.robot.robot import Robot
 
 BASE_LINK = "base"

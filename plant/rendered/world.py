@@ -239,7 +239,7 @@ class RenderedWorld(World):
     def _joint_position(self) -> FloatArray:
         """Return the exact joint positions q = (θ − o)/g, (n,) rad."""
         arm = self._model.arm
-        return np.asarray((self._joints.angle - arm.joint_offset) / arm.gear_ratio)
+        return (self._joints.angle - arm.joint_offset) / arm.gear_ratio
 
     def _reported(self) -> FloatArray:
         """Return the joint positions in steps of the encoders, (n,) rad; the scale ends at the stops."""

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, as_array
 
-# Indices of the factors in a cross product
+# IntArray of the factors in a cross product
 YZX = np.array([1, 2, 0])
 ZXY = np.array([2, 0, 1])
 
@@ -171,7 +171,7 @@ class SerialArm:
     def ball(self, frames: FloatArray) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for `frames`."""
         flange = frames[..., -1, :, :]
-        return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
+        return np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3]
 
 
 def plain_arm(
@@ -249,6 +249,29 @@ class JointLimits:
             )
         if not (self.speed > 0.0).all():
             raise ValueError(f"joint_velocity_limit must be positive, got {self.speed.tolist()}")
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The moving links as rigid bodies and as shapes; row i is the link after joint i+1.
+
+    Masses lie in the frame at the link's far end, before the rotation of the next joint: DH frame i+1.
+    """
+
+    mass: FloatArray  # (n,) [kg]
+    centre: FloatArray  # (n, 3) [m], centre of mass
+    inertia: FloatArray  # about it [kg m²]: (n, 2), across the link and along it; or (n, 3, 3)
+    torque: FloatArray  # (n,) [Nm], largest of the joint
+    radius: FloatArray  # (n,) [m], radius of the link's tube
+    aside: FloatArray  # (n,) [m], offset of the tube from its joints, along the joint's axis
+    payload: float  # rated load [kg]
+
+    def __post_init__(self) -> None:
+        """Check the shapes and freeze the arrays."""
+        n = len(self.mass)
+        freeze_arrays(self, (n,), "mass", "torque", "radius", "aside")
+        freeze_arrays(self, (n, 3), "centre")
+        freeze_arrays(self, (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2), "inertia")
 
 
 def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float) -> JointLimits:

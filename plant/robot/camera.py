@@ -7,7 +7,7 @@ offset the error is 2.5 mm at 1.3 m.
 """
 
 from dataclasses import replace
-from typing import Annotated, Self, TypeAlias
+from typing import Annotated, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,6 @@ from servobench.plant.contract.settings import Count, Positive, settings
 
 # Sampling point of TinyRenderer, from the pixel's upper left corner
 PIXEL_CENTRE = (0.0, 1.0)  # [px]
-IntArray: TypeAlias = npt.NDArray[np.intp]
 
 
 @settings
@@ -88,7 +87,7 @@ class PinholeCamera:
         value = np.asarray(buffer, dtype=np.float64)
         near = self.near
         far = self.far
-        return np.asarray(near * far / (far - (far - near) * value))
+        return near * far / (far - (far - near) * value)
 
     def projection_matrix(self) -> FloatArray:
         """Return the OpenGL projection matrix, (4, 4)."""

@@ -252,7 +252,7 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
         ValueError: a file that cannot be used; one line with its path.
     """
     is_toml = path.suffix.lower() == ".toml"
-    values: dict[str, Any] = {"intrinsics": path.name}
+    values = {"intrinsics": path.name}
     if is_toml:
         values = read_toml("camera file", path)
     if "matrix" in values:

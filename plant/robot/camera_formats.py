@@ -123,8 +123,7 @@ def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:
         return found
     if len(cameras) > 1:
         remark(f"{path.name}: the camera {cameras[0]} of {', '.join(cameras)} is taken")
-    chosen: dict[Any, Any] = found[cameras[0]]
-    return chosen
+    return found[cameras[0]]
 
 
 def _flat(found: dict[Any, Any]) -> dict[str, Any]:
@@ -176,7 +175,7 @@ def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
     if value is None:
         return []
     if isinstance(value, list):
-        cells: list[Any] = np.array(value, dtype=object).ravel().tolist()
+        cells = np.array(value, dtype=object).ravel().tolist()
         for cell in cells:
             if not isinstance(cell, int | float) or not isfinite(cell):
                 raise ValueError(f"a matrix must hold finite numbers, got {cell!r}")

@@ -247,7 +247,7 @@ def random_robot(number: int) -> Robot:
     for _ in range(MAX_DRAWS):
         arm = _draw_arm(n, generator)
         links = estimate_links(arm)
-        workspace = search_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        workspace = search_workspace(arm, limits, links)
         if workspace is not None:
             source = f"drawn from the number {number}"
             note = f"{name} has {n} joints"

@@ -126,7 +126,7 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
         mass = as_array("mass", table.mass, (n,)) if table.mass else None
         torque = as_array("torque", table.torque, (n,)) if table.torque else None
         links = estimate_links(arm, mass, torque)
-        workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        workspace = find_workspace(arm, limits, links)
         name = table.name or path.stem
         note = ""
         if not table.mass:

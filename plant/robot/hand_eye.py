@@ -93,7 +93,7 @@ class RobotModel(ABC):
             return self.marks
         R_BF = flange[..., None, :3, :3]
         p_BF = flange[..., None, :3, 3]
-        return np.asarray(np.matvec(R_BF, self.marks) + p_BF)
+        return np.matvec(R_BF, self.marks) + p_BF
 
     def mounted(self, flange: FloatArray, points: FloatArray) -> FloatArray:
         """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
@@ -101,13 +101,13 @@ class RobotModel(ABC):
             return points
         R_BF = flange[..., None, :3, :3]
         p_BF = flange[..., None, :3, 3]
-        return np.asarray(np.vecmat(points - p_BF, R_BF))
+        return np.vecmat(points - p_BF, R_BF)
 
     def in_cameras(self, points: FloatArray) -> FloatArray:
         """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
         cameras = self.poses[..., None, :, :]
         from_camera = points[..., None, :, :] - cameras[..., :3, 3]
-        return np.asarray(np.vecmat(from_camera, cameras[..., :3, :3]))
+        return np.vecmat(from_camera, cameras[..., :3, :3])
 
     def with_lens(self, deviation: FloatArray) -> Self:
         """Return this model with deviating intrinsics, 1 + focal, centre [px] and distortion, (4,), if it has any."""
@@ -276,7 +276,7 @@ class HandEyeModel(RobotModel):
         p_B, J_B = self.arm.ball_and_jacobian(joint_position)
         R_CB = np.swapaxes(self.X_BC[..., :3, :3], -1, -2)
         y = self.to_camera(p_B)
-        J = np.asarray(R_CB @ J_B)
+        J = R_CB @ J_B
         y.setflags(write=False)
         J.setflags(write=False)
         return y, J, None
@@ -285,12 +285,12 @@ class HandEyeModel(RobotModel):
         """Return points of the base frame in the camera frame, (..., 3) m."""
         p = np.asarray(p_B, dtype=np.float64)
         from_camera = p - self.X_BC[..., :3, 3]
-        return np.asarray(np.vecmat(from_camera, self.X_BC[..., :3, :3]))
+        return np.vecmat(from_camera, self.X_BC[..., :3, :3])
 
     def to_base(self, p_C: npt.ArrayLike) -> FloatArray:
         """Return points of the camera frame in the base frame, (..., 3) m."""
         p = np.asarray(p_C, dtype=np.float64)
-        return np.asarray(np.matvec(self.X_BC[..., :3, :3], p) + self.X_BC[..., :3, 3])
+        return np.matvec(self.X_BC[..., :3, :3], p) + self.X_BC[..., :3, 3]
 
 
 @dataclass(frozen=True, eq=False)

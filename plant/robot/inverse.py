@@ -56,7 +56,7 @@ def closest_distance(
     drawn = drawn.reshape(STARTS, *(1,) * len(lead), n)
     starts = np.broadcast_to(drawn, (STARTS, *lead, n))
     _, distance = _search(arm, target, starts, (low, high), one_is_enough=True)
-    return np.asarray(distance.min(axis=0))
+    return distance.min(axis=0)
 
 
 def reach_for(
@@ -144,7 +144,7 @@ def _step(
     damped = plus_diagonal(J @ J.mT, damping[..., None])
     weighted = np.linalg.solve(damped, error[..., None])[..., 0]
     step = np.vecmat(weighted, J)
-    return np.asarray(np.clip(q + step, lower, upper))
+    return np.clip(q + step, lower, upper)
 
 
 POSE_ITERATIONS = 100

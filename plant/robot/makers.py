@@ -20,8 +20,8 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, plain_arm
-from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
+from servobench.plant.robot.arm import JointLimits, Links, SerialArm, arm_from_dh, plain_arm
+from servobench.plant.robot.robot import Robot, at_far_end, cylinder_inertia
 from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
 
 Triple = tuple[float, float, float]
@@ -81,7 +81,6 @@ def universal_robot(title: str) -> Robot:
     arm = with_ball(row.arm())
     scale = length_scale(arm)
     radius = scale * np.array(ur5.LINKS["radius"])
-    aside = scale * np.array(ur5.LINKS["aside"])
     mass = np.array(row.mass)
     links = Links(
         mass,
@@ -89,10 +88,10 @@ def universal_robot(title: str) -> Robot:
         cylinder_inertia(mass, radius, arm),
         np.repeat(row.torque, ALIKE),
         radius,
-        aside,
+        scale * np.array(ur5.LINKS["aside"]),
         row.payload,
     )
-    workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
+    workspace = find_workspace(arm, limits, links)
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
 
 
@@ -116,7 +115,7 @@ def panda() -> Robot:
         np.zeros(7),
         payload=3.0,
     )
-    workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+    workspace = find_workspace(arm, limits, links)
     return Robot("panda", "Panda", PANDA_SOURCE, arm, limits, links, workspace)
 
 

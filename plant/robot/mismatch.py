@@ -156,8 +156,8 @@ class Mismatch:
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
         """
-        sensed: list[tuple[str, str, float | str]] = []
-        geared: dict[str, float | str] = {}
+        sensed = []
+        geared = {}
         for axis, magnitude in self.axes:
             size = magnitude.size(axis)
             if axis in SENSOR_AXES:

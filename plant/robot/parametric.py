@@ -25,12 +25,11 @@ contiguous numbers; stacks of small matrices cost several times as much.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.features import Derivatives
 from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
@@ -40,7 +39,6 @@ from servobench.plant.robot.twin import TOOL, links_of
 TARGET = ("target_x", "target_y", "target_z")
 """[m] added to the target's place in the base frame, for cameras on the hand."""
 ALIGNMENT = 0.002  # [m²] weight of the planned rotation in `placed`
-Indices: TypeAlias = npt.NDArray[np.int_]
 POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 
@@ -215,10 +213,10 @@ class ParametricModel:
         return self.columns("link_")
 
     @cached_property
-    def _lengths(self) -> tuple[Indices, Indices]:
+    def _lengths(self) -> tuple[IntArray, IntArray]:
         """Row and axis of each length among the translations."""
         places = [(row, axis) for _, row, axis in links_of(self.planned.arm)]
-        table: Indices = np.array(places, dtype=np.int_).reshape(-1, 2)
+        table: IntArray = np.array(places, dtype=np.int_).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
     @cached_property

@@ -17,35 +17,12 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
-from servobench.plant.robot.arm import JointLimits, SerialArm, freeze_arrays, rotation_from_rpy
+from servobench.plant.robot.arm import JointLimits, Links, SerialArm, rotation_from_rpy
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.camera_file import OwnCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.twin import Twin
 from servobench.plant.robot.workspace import Clearance, Workspace
-
-
-@dataclass(frozen=True, eq=False)
-class Links:
-    """The moving links as rigid bodies and as shapes; row i is the link after joint i+1.
-
-    Masses lie in the frame at the link's far end, before the rotation of the next joint: DH frame i+1.
-    """
-
-    mass: FloatArray  # (n,) [kg]
-    centre: FloatArray  # (n, 3) [m], centre of mass
-    inertia: FloatArray  # about it [kg m²]: (n, 2), across the link and along it; or (n, 3, 3)
-    torque: FloatArray  # (n,) [Nm], largest of the joint
-    radius: FloatArray  # (n,) [m], radius of the link's tube
-    aside: FloatArray  # (n,) [m], offset of the tube from its joints, along the joint's axis
-    payload: float  # rated load [kg]
-
-    def __post_init__(self) -> None:
-        """Check the shapes and freeze the arrays."""
-        n = len(self.mass)
-        freeze_arrays(self, (n,), "mass", "torque", "radius", "aside")
-        freeze_arrays(self, (n, 3), "centre")
-        freeze_arrays(self, (n, 3, 3) if np.ndim(self.inertia) == 3 else (n, 2), "inertia")
 
 
 @dataclass(frozen=True, eq=False)

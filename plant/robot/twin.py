@@ -161,7 +161,7 @@ class Twin:
     def times(self, seed: int) -> dict[str, float]:
         """Return the known ones of latency, delay and lag of a run by key of a plant [s], rounded to milliseconds."""
         drawn = self.values(seed)
-        times: dict[str, float] = {}
+        times = {}
         for name in TIMES:
             if name in drawn:
                 key = "sensing.latency" if name == "latency" else name

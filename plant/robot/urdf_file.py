@@ -11,9 +11,9 @@ from annotated_types import Ge, Le
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import Check, Number, Positive, read_value, remark
-from servobench.plant.robot.arm import JointLimits, SerialArm, plain_arm, rpy_from_rotation
+from servobench.plant.robot.arm import JointLimits, Links, SerialArm, plain_arm, rpy_from_rotation
 from servobench.plant.robot.files import Mass
-from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
+from servobench.plant.robot.robot import Robot, at_far_end, estimate_links
 from servobench.plant.robot.urdf_chain import Chain, Joint, JointElement, find_chain, pose_of
 from servobench.plant.robot.urdf_elements import Tree, read_elements
 from servobench.plant.robot.workspace import find_workspace, with_ball
@@ -57,9 +57,7 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
         limits = _limits([link.joint for link in chain.joints])
         links, estimates = _links(tree, chain.joints, arm, flaws)
         try:
-            workspace = find_workspace(
-                arm, (limits.lower, limits.upper), (links.radius, links.aside)
-            )
+            workspace = find_workspace(arm, limits, links)
         except ValueError as error:
             raise ValueError(f"{error}; {chain.ending}".removesuffix("; ")) from error
     flaw = ""
@@ -272,4 +270,4 @@ def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
         remark(
             f"link {link!r}: no body has the {came}, one above the others' sum; taken as {taken}"
         )
-    return np.asarray(axes * moments @ axes.T)
+    return axes * moments @ axes.T

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, IntArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
-from servobench.plant.robot.arm import SerialArm, freeze_arrays
-from servobench.plant.robot.camera import CAMERA, IntArray, PinholeCamera
+from servobench.plant.robot.arm import JointLimits, Links, SerialArm, freeze_arrays
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
 CENTRE = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
@@ -120,19 +120,19 @@ class Tubes:
     def placed(self, frames: FloatArray) -> FloatArray:
         """Return both ends of each tube in the base frame, (..., s, 2, 3) m, for frames (..., n+1, 4, 4)."""
         own = frames[..., self.link, None, :, :]
-        return np.asarray(np.matvec(own[..., :3, :3], self.ends) + own[..., :3, 3])
+        return np.matvec(own[..., :3, :3], self.ends) + own[..., :3, 3]
 
 
-def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
-    """Return the tubes of links with a `radius`, (n,) m, at an offset `aside`, (n,) m, from their joints."""
+def link_tubes(arm: SerialArm, links: Links) -> Tubes:
+    """Return the tubes of an arm's links."""
     tubes = []
     for i in range(arm.n):
         next_joint = arm.translation[i + 1]
-        side = np.array([0.0, 0.0, aside[i]])
-        corner = np.array([next_joint[0], next_joint[1], aside[i]])
-        tubes.append((i, (side, corner), ASIDE_RADIUS * radius[i]))
+        side = np.array([0.0, 0.0, links.aside[i]])
+        corner = np.array([next_joint[0], next_joint[1], links.aside[i]])
+        tubes.append((i, (side, corner), ASIDE_RADIUS * links.radius[i]))
         if np.linalg.norm(next_joint - corner) > MIN_TUBE_LENGTH:
-            tubes.append((i, (corner, next_joint), LINK_RADIUS * radius[i]))
+            tubes.append((i, (corner, next_joint), LINK_RADIUS * links.radius[i]))
     link, ends, radii = map(np.array, zip(*tubes, strict=True))
     return Tubes(link, ends, radii)
 
@@ -220,7 +220,7 @@ def collision_pairs(clearance: Clearance, postures: FloatArray) -> IntArray:
     placed = clearance.tubes.placed(clearance.arm.frames(postures))
     overlap_share = (clearance.gaps(placed, pairs) < 0.0).mean(axis=0)
     built_in = overlap_share > BUILT_IN_SHARE
-    return np.asarray(pairs[~built_in])
+    return pairs[~built_in]
 
 
 def segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -300,13 +300,13 @@ def with_ball(arm: SerialArm) -> SerialArm:
     return replace(arm, tool=np.array([0.0, 0.0, TOOL * length_scale(arm)]))
 
 
-def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
+def find_workspace(arm: SerialArm, limits: JointLimits, links: Links) -> Workspace:
     """Return the workspace of an arm, as `search_workspace`.
 
     Raises:
         ValueError: no posture is fit to work in: the arm cannot reach the middle of its bench.
     """
-    found = search_workspace(arm, limits, shapes)
+    found = search_workspace(arm, limits, links)
     if found is not None:
         return found
     if arm.n < 3 or length_scale(arm) == 0.0:
@@ -314,24 +314,24 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
             f"an arm has three joints or more and links with lengths, got {arm.n} joints and links of "
             f"{LENGTH_OF_UR5 * length_scale(arm):g} m in all"
         )
-    look = _likely_cause(arm, limits, shapes)
+    look = _likely_cause(arm, limits, links)
     raise ValueError(
         "the arm has no posture in which its ball is over the table, in view of the camera and free of contact; "
         f"look at {look}"
     )
 
 
-def _likely_cause(arm: SerialArm, limits: Pair, shapes: Pair) -> str:
+def _likely_cause(arm: SerialArm, limits: JointLimits, links: Links) -> str:
     """Return what in the description of an arm without a fit posture is likely wrong."""
-    whole_turn = (np.full(arm.n, -np.pi), np.full(arm.n, np.pi))
-    if _at_height(arm, whole_turn, shapes, HEIGHTS[-1]) is not None:
+    whole_turn = replace(limits, lower=np.full(arm.n, -np.pi), upper=np.full(arm.n, np.pi))
+    if _at_height(arm, whole_turn, links, HEIGHTS[-1]) is not None:
         return "its joint limits, which forbid all of them"
     shift = arm.translation[0]
     if shift.any():
         for height in (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4))):
             translation = np.vstack([(0.0, 0.0, height), arm.translation[1:]])
             moved = replace(arm, translation=translation)
-            if _at_height(moved, limits, shapes, HEIGHTS[0]) is not None:
+            if _at_height(moved, limits, links, HEIGHTS[0]) is not None:
                 place = ", ".join(f"{each:g}" for each in shift)
                 return f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
     return (
@@ -339,19 +339,19 @@ def _likely_cause(arm: SerialArm, limits: Pair, shapes: Pair) -> str:
     )
 
 
-def search_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace | None:
+def search_workspace(arm: SerialArm, limits: JointLimits, links: Links) -> Workspace | None:
     """Return the workspace of an arm, None where no posture is fit to work in.
 
     Args:
         arm: the nominal arm with its ball.
-        limits: lower and upper joint positions, (n,) and (n,) rad.
-        shapes: radius of each link's tube and how far it lies aside, (n,) and (n,) m.
+        limits: of its joints.
+        links: with the shapes of its tubes.
     """
     if arm.n < 3 or length_scale(arm) <= 0.0:
         return None
     found = []
     for height in HEIGHTS:
-        at_height = _at_height(arm, limits, shapes, height)
+        at_height = _at_height(arm, limits, links, height)
         if at_height is not None:
             found.append(at_height)
             if at_height.score >= GOOD_BOX:
@@ -368,25 +368,25 @@ class Found(NamedTuple):
     make: Callable[[], Workspace]  # its moves take longer to find than all the rest
 
 
-def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> Found | None:
+def _at_height(arm: SerialArm, limits: JointLimits, links: Links, height: float) -> Found | None:
     """Return the workspace of an arm at a height; None where no home is found."""
     scale = length_scale(arm)
     lift = np.array([0.0, 0.0, height])
     centre = scale * (np.array(CENTRE) + lift)
     pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
-    lower, upper = limits
     clear = Clearance(
         arm,
-        link_tubes(arm, *shapes),
-        lower,
-        upper,
+        link_tubes(arm, links),
+        limits.lower,
+        limits.upper,
         pose,
         scale,
         BALL_RADIUS * scale,
     )
     rng = np.random.default_rng(0)
-    within_turn = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
-    postures = rng.uniform(*within_turn, (STARTS, arm.n))
+    lower = np.maximum(limits.lower, -np.pi)
+    upper = np.minimum(limits.upper, np.pi)
+    postures = rng.uniform(lower, upper, (STARTS, arm.n))
     clear = replace(clear, pairs=collision_pairs(clear, postures))
     home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
     if home is None:
@@ -511,4 +511,4 @@ def _stretch(
     if not len(fit):
         fit = np.vstack([home, postures[clear(postures, singular=True)]])
     gain = clear.gain(clear.arm.frames(fit))
-    return np.asarray(fit[np.argmin(gain)])
+    return fit[np.argmin(gain)]

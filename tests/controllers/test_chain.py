@@ -130,7 +130,7 @@ OF_LAWS = [  # name, settings, aids
     ("pid", {"damping": 0.0}, {"limit": "redistribute"}),
     ("mfac", {}, {"feedforward": True, "limit": "redistribute"}),
     ("mpc", {}, {"posture": True}),
-    ("mpc", {**TIGHT, "horizon_time": 0.4, "delay": 0.1, "fallback": "closed_form"},
+    ("mpc", {**TIGHT, "horizon_time": 0.4, "delay": 0.1},
      {"delay": "ignored", "response": "ignored", "filter": False}),
     ("mpc", {**TIGHT, "mode": "constant", "terminal_weight": 1.0, "use_preview": False}, {"posture": True}),
     ("rbfnn", {}, {}),
@@ -138,7 +138,7 @@ OF_LAWS = [  # name, settings, aids
      {"feedforward": True}),
 ]  # fmt: skip
 OF_ESTIMATORS = [
-    *((name, {}) for name in ESTIMATORS), ("kalman", {"form": "full"}), ("ukf", {"form": "sigma_points"}),
+    *((name, {}) for name in ESTIMATORS), ("ukf", {"form": "sigma_points"}),
     ("rbf", {"window": 1}),
 ]  # fmt: skip
 AIDS = [

@@ -34,8 +34,7 @@ def robot_of(folder, name, content):
 
 def found(robot):
     """Return the workspace of a robot, found once more."""
-    limits, links = robot.limits, robot.links
-    return find_workspace(robot.arm, (limits.lower, limits.upper), (links.radius, links.aside))
+    return find_workspace(robot.arm, robot.limits, robot.links)
 
 
 @pytest.fixture(scope="session")

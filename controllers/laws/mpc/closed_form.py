@@ -102,7 +102,7 @@ def decay_targets(error: FloatArray, reference_step: FloatArray, shares: FloatAr
     Returns:
         (..., H, m), m.
     """
-    return np.asarray(reference_step + shares[:, None] * error[..., None, :])
+    return reference_step + shares[:, None] * error[..., None, :]
 
 
 def move_weights(horizon: int, alpha: float, terminal_weight: float) -> FloatArray:

@@ -14,7 +14,6 @@ from servobench.controllers.laws.mpc.qp import (
     QpBounds,
     QpProgram,
     QpShape,
-    Solver,
     exceeds,
     joint_bounds,
     view_rows,
@@ -67,10 +66,8 @@ class MpcConfig:
     """Keep predicted joint positions within the plant's limits."""
     view_tangent: tuple[Positive, ...] = ()
     """[1] (h, v): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty: no limit."""
-    solver: Solver = "daqp"
-    """QP solver; "qpoases" for a cross-check."""
-    fallback: Literal["hold", "closed_form", "raise"] = "hold"
-    """Without a solution: zero velocity, the scaled unlimited law, or `SolverFailed`."""
+    fallback: Literal["hold", "raise"] = "hold"
+    """Without a solution: zero velocity, or `SolverFailed`."""
 
     def __post_init__(self) -> None:
         """Check across fields."""
@@ -191,7 +188,7 @@ class MpcLaw(Law[MpcState]):
             self._unlimited = closed_form.UnlimitedPlan.of_constant_step(gain, horizon, self._Q)
         else:
             self._unlimited = closed_form.UnlimitedPlan.of_free_moves(weights, self._Q)
-        self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
+        self._program = QpProgram(self._shape, raises=config.fallback == "raise")
 
     def start(self, observation: Observation) -> MpcState:
         """Return the state of an arm at rest."""
@@ -316,7 +313,7 @@ class MpcLaw(Law[MpcState]):
         _, b, c = self._integrals
         integral = (b - c) * error + np.vecmat(self._preview_weights, ahead)
         terminal = self._terminal * self._blocks.count * targets[..., -1, :]
-        return np.asarray((integral + terminal)[..., None, :])
+        return (integral + terminal)[..., None, :]
 
     def _limited(self, plan: Plan, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> Plan:
         """Return the best plan within the limits."""
@@ -335,10 +332,7 @@ class MpcLaw(Law[MpcState]):
         if solution.success:
             active = np.count_nonzero(np.abs(solution.multiplier) > _MIN_MULTIPLIER)
             return solution.moves, 1.0, solution.iterations, float(active)
-        step = np.zeros(self._spec.n)
-        if self._config.fallback != "hold":
-            step = scale_to_limit(moves[0], self._shape.largest_move)
-        return np.tile(step, (len(moves), 1)), 0.0, solution.iterations, math.nan
+        return np.zeros_like(moves), 0.0, solution.iterations, math.nan
 
 
 def _owned_stages(config: MpcConfig) -> frozenset[Stage]:

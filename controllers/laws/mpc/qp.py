@@ -16,12 +16,10 @@ Every solve starts cold, so that a solution depends on its arguments alone: the 
 DAQP a sixth of its time.
 """
 
-import contextlib
-import io
 import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple, TypeAlias, final
+from typing import Any, NamedTuple, final
 
 import daqp
 import numpy as np
@@ -30,10 +28,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.signals import BoolArray, PlantSpec
 
-Solver: TypeAlias = Literal["daqp", "qpoases"]
 # Tolerances are those of the constraints in rad: far below an encoder step, far above rounding.
 _DAQP_OPTIONS = {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}
-_QPOASES_OPTIONS = {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12}
 _DAQP_STATUS = {
     -1: "infeasible", -2: "cycling", -3: "unbounded", -4: "iteration limit reached", -5: "not convex",
     -6: "overdetermined",
@@ -179,7 +175,7 @@ def exceeds(
     if len(shape.view_rows):
         moved = travel @ (shape.view_rows @ J).mT
         broken = broken | _any(moved < bounds.view_margin[..., None, :], axis=(-2, -1))
-    return np.asarray(broken)
+    return broken
 
 
 @final
@@ -190,16 +186,14 @@ class QpProgram:
     horizon: ∫ τ α^τ target(τ) dτ.
     """
 
-    def __init__(self, shape: QpShape, solver: Solver, *, raises: bool) -> None:
+    def __init__(self, shape: QpShape, *, raises: bool) -> None:
         """Build the function of the matrices.
 
         Args:
             shape: sizes, weights and the kinds of rows.
-            solver: its name.
             raises: whether `SolverFailed` is raised where there is no solution.
         """
-        self._shape, self._solver, self._raises = shape, solver, raises
-        self._solve = _solve_daqp if solver == "daqp" else _solve_qpoases
+        self._shape, self._raises = shape, raises
         self._largest = np.tile(shape.largest_move, shape.moves)
         self._function = _matrices(shape)
         count = self._largest.size
@@ -238,19 +232,22 @@ class QpProgram:
             np.concatenate([lower, row_lower[near]]),
             np.concatenate([upper, row_upper[near]]),
         )
-        x, value, multiplier, status, iterations = self._solve(
-            self._H, self._g, self._A[near], lower, upper
+        x, value, flag, found = daqp.solve(
+            self._H, self._g, self._A[near], upper, lower, **_DAQP_OPTIONS
         )
+        status = ""
+        if flag != 1:
+            status = _DAQP_STATUS.get(flag, f"exit flag {flag}")
         success = not status and bool(np.isfinite(x).all())
         if self._raises and not success:
-            raise SolverFailed(f"{self._solver} found no solution within the limits: {status}")
+            raise SolverFailed(f"daqp found no solution within the limits: {status}")
         return QpSolution(
             success,
             x.reshape(-1, n),
             value + float(self._c[0]),
-            multiplier,
+            found["lam"],
             status,
-            float(iterations),
+            float(found["iterations"]),
         )
 
     def _row_bounds(self, bounds: QpBounds) -> tuple[FloatArray, FloatArray]:
@@ -263,44 +260,6 @@ class QpProgram:
             rows = [(-change, change)] * (shape.moves - 1) + rows
         lower, upper = zip(*rows, strict=True)
         return np.concatenate(lower), np.concatenate(upper)
-
-
-# x, criterion, multipliers, error or "", iterations
-_Answer: TypeAlias = tuple[FloatArray, float, FloatArray, str, int]
-
-
-def _solve_daqp(
-    H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray
-) -> _Answer:
-    x, value, flag, information = daqp.solve(H, g, A, upper, lower, **_DAQP_OPTIONS)
-    status = "" if flag == 1 else _DAQP_STATUS.get(flag, f"exit flag {flag}")
-    return x, value, information["lam"], status, information["iterations"]
-
-
-def _solve_qpoases(
-    H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray
-) -> _Answer:
-    """Solve with a new solver each time, because qpOASES starts from the working set of the last solve."""
-    import casadi  # noqa: PLC0415 - other methods start without it
-
-    n = len(g)
-    structure = {"h": casadi.Sparsity.dense(n, n), "a": casadi.Sparsity.dense(len(A), n)}
-    options: dict[str, Any] = {"error_on_fail": False, "print_time": False, **_QPOASES_OPTIONS}
-    with contextlib.redirect_stdout(
-        io.StringIO()
-    ):  # qpOASES prints a banner when it is made and first used
-        solver = casadi.conic("mpc", "qpoases", structure, options)
-        found = solver(h=H, g=g, a=A, lbx=lower[:n], ubx=upper[:n], lba=lower[n:], uba=upper[n:])
-    statistics = solver.stats()
-    multiplier = np.concatenate([np.asarray(found[name]).ravel() for name in ("lam_x", "lam_a")])
-    status = "" if statistics["success"] else str(statistics["return_status"])
-    return (
-        np.asarray(found["x"]).ravel(),
-        float(found["cost"]),
-        multiplier,
-        status,
-        statistics["iter_count"],
-    )
 
 
 @lru_cache(maxsize=16)
@@ -336,5 +295,4 @@ def _matrices(shape: QpShape) -> Any:  # noqa: ANN401 - casadi.Function
     x = casadi.vec(dq)
     A, _ = casadi.linear_coeff(casadi.vertcat(*rows), x)
     results = casadi.cse([casadi.densify(part) for part in (*casadi.quadratic_coeff(cost, x), A.T)])
-    create: Any = casadi.Function  # its annotations do not know SX
-    return create("program", [casadi.horzcat(*transposed), targets], results)
+    return casadi.Function("program", [casadi.horzcat(*transposed), targets], results)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,7 @@ import typer
 from servobench.harness.cli.options import option, switch
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, write_atomically
+from servobench.plant.contract.files import accessing, write_text
 
 TEMPLATES = files("servobench.harness.apps.check") / "templates"
 PREFIX = "test_"
@@ -72,7 +71,7 @@ def new(
         for path, template in wanted.items():
             text = (TEMPLATES / f"{template}.py.txt").read_text(encoding="utf-8")
             text = text.replace("{{module}}", module).replace("{{Class}}", class_name)
-            write_atomically(path, partial(Path.write_text, data=text, encoding="utf-8"))
+            write_text(path, text)
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
     lines = [
@@ -100,7 +99,7 @@ def check(
     from servobench.harness.apps.check.controllers import check_controller
     from servobench.harness.apps.check.plants import check_plant
     from servobench.harness.apps.check.report import Finding
-    from servobench.harness.apps.check.trial import Checks, run_checks
+    from servobench.harness.apps.check.trial import run_checks
 
     if subject == ["plant"]:
         raise ConfigurationError(
@@ -111,8 +110,8 @@ def check(
         raise ConfigurationError(
             f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}"
         )
-    checks: Checks = check_plant if is_plant else check_controller
-    findings: list[Finding] = []
+    checks = check_plant if is_plant else check_controller
+    findings = []
 
     def hear(finding: Finding) -> None:
         findings.append(finding)

@@ -74,11 +74,11 @@ class Rig(Plant):
 
     def feature(self, q: FloatArray) -> FloatArray:
         """Return the true feature (..., m) [m] at joint positions (..., n) [rad]."""
-        return np.asarray(np.matvec(self.A, q + BEND * q**3))
+        return np.matvec(self.A, q + BEND * q**3)
 
     def jacobian(self, q: FloatArray) -> FloatArray:
         """Return the true Jacobian (..., m, n) [m/rad] at joint positions (..., n) [rad]."""
-        return np.asarray(self.A * (1.0 + 3.0 * BEND * q**2)[..., None, :])
+        return self.A * (1.0 + 3.0 * BEND * q**2)[..., None, :]
 
     def model_jacobian(self, q: FloatArray) -> FloatArray:
         """Return the Jacobian of the nominal model, as `jacobian`."""
@@ -219,7 +219,7 @@ def watching_draws() -> Iterator[list[str]]:
 
 
 def _states() -> dict[str, object]:
-    shared: Any = np.random.get_state(legacy=False)  # noqa: NPY002 - it is compared, not used
+    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - it is compared, not used
     return {
         "numpy.random": (shared["state"]["key"].tobytes(), shared["state"]["pos"]),
         "random": random.getstate(),
@@ -260,8 +260,8 @@ class Shared:
 
     def __init__(self, kind: type) -> None:
         """Keep their values."""
-        modules: dict[str, object] = {}
-        classes: dict[str, object] = {}
+        modules = {}
+        classes = {}
         for each in kind.__mro__:
             name = each.__module__
             module = sys.modules.get(name)

@@ -1,7 +1,6 @@
 """All figures of a results folder, from its tables alone."""
 
 import textwrap
-import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -48,6 +47,7 @@ from servobench.harness.apps.figures.tracks import (
 )
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.run.request import UNFIT_FOR_FILES
+from servobench.plant.contract.facts import read_beside
 
 FOLDER = "figures"
 LETTERS = 15.0  # letters of a title in an inch
@@ -64,8 +64,7 @@ class Kind(NamedTuple):
     in_page: bool = True  # whether the report shows it
 
 
-_KINDS_FILE = Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8")
-KINDS = {name: Kind(**kind) for name, kind in tomllib.loads(_KINDS_FILE).items()}
+KINDS = {name: Kind(**kind) for name, kind in read_beside(__file__, "kinds.toml").items()}
 
 
 class NamedFigure(NamedTuple):
@@ -95,7 +94,7 @@ def draw_figures(folder: ResultsFolder) -> list[Path]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    paths: list[Path] = []
+    paths = []
     for named in folder_figures(folder):
         paths += save_figure(named.figure, folder.path / FOLDER / named.stem, ("png",))
     return paths

@@ -193,4 +193,4 @@ def _draw_direction(axes: Axes, reference: FloatArray) -> None:
 def _points(track: Track, kind: str) -> FloatArray:
     """Return those rows of the features that are known throughout, (k, m)."""
     points = track.vectors(kind)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
+    return points[np.isfinite(points).all(axis=1)]

@@ -5,13 +5,11 @@ import io
 import math
 import re
 import shutil
-import tomllib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any, Literal, NamedTuple, Self
@@ -27,13 +25,12 @@ from PIL import Image
 
 from servobench.controllers.methods import METHODS, PUBLISHED
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.units import split_quantity
 
-_SHEET = tomllib.loads(
-    (files("servobench.harness.apps.figures") / "style.toml").read_text(encoding="utf-8")
-)
+_SHEET = read_beside(__file__, "style.toml")
 COLOURS: dict[str, str] = _SHEET["colours"]
 MARKS = 8  # markers on each line
 WIDTH = 7.2  # [in] width of a figure: both columns of a paper

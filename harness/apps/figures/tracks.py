@@ -265,8 +265,8 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
     below = math.floor(place)
     part = place - below
     if not part:  # zero times an infinite value above would be NaN
-        return np.asarray(ordered[below])
-    return np.asarray((1.0 - part) * ordered[below] + part * ordered[below + 1])
+        return ordered[below]
+    return (1.0 - part) * ordered[below] + part * ordered[below + 1]
 
 
 def load_ensembles(folder: ResultsFolder, runs: pd.DataFrame) -> dict[str, Ensembles]:

@@ -119,7 +119,7 @@ def find_ffmpeg() -> str:
     """
     remedy = f"--kinds {SNAPSHOTS} works without it"
     try:
-        package: Any = import_module("imageio_ffmpeg")
+        package = import_module("imageio_ffmpeg")
         return str(package.get_ffmpeg_exe())
     except ImportError as error:
         raise ConfigurationError(f"{missing_extra(error, 'a film')}; {remedy}") from error

@@ -124,7 +124,7 @@ def write_report(folder: ResultsFolder, path: Path | None = None) -> Path:
 
 def report_pictures(folder: ResultsFolder, runs: pd.DataFrame) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
-    pictures: list[Picture] = []
+    pictures = []
     size = 0
     kinds = [name for name, kind in KINDS.items() if kind.in_page]
     for named, slim in page_figures(folder, runs, kinds):

@@ -11,17 +11,15 @@ one, which as a size is above that of any packet. A TLS record begins with 0x16,
 import asyncio
 import re
 import struct
-import tomllib
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.resources import files
 from itertools import islice
 from typing import Any, Self, TypeAlias
 
-CONTROLLER = tomllib.loads(
-    files(__package__).joinpath("controller.toml").read_text(encoding="utf-8")
-)
+from servobench.plant.contract.facts import read_beside
+
+CONTROLLER = read_beside(__file__, "controller.toml")
 MAX_NAMES = 2048  # bytes of a list of names, by the guide
 # Bytes of a packet of a client: a list of names with its frequency
 MAX_PACKET = 3 + 8 + MAX_NAMES
@@ -101,7 +99,7 @@ class Recipe:
                 f"data of {self.names[0]} … must be {self.layout.size} bytes, got {len(body)}"
             )
         numbers = iter(self.layout.unpack(body))
-        values: dict[str, Any] = {}
+        values = {}
         for name, kind in zip(self.names, self.types, strict=True):
             size = len(ZEROS[kind])
             first, *others = islice(numbers, size)

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from numpy.typing import ArrayLike
 
 from servobench.harness.analysis.comparison import ALPHA, CONFIDENCE, RESAMPLES, Estimate, holm
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, IntArray
 
 TRIMMED = 0.25  # share of the scores that an interquartile mean leaves out at each end
 SPLITS = 200  # random halves of the robots from which the resolution is estimated
@@ -53,7 +52,7 @@ def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray
     bound = np.where(np.isfinite(reference), np.maximum(reference, floor), known)
     with np.errstate(invalid="ignore"):  # ∞ / ∞, where both are lost
         ratio = np.minimum(1.0, bound / known)
-    return np.asarray(np.where(np.isinf(known), 0.0, ratio))
+    return np.where(np.isinf(known), 0.0, ratio)
 
 
 def ranking(table: pd.DataFrame) -> list[Ranked]:
@@ -74,7 +73,7 @@ def ranking(table: pd.DataFrame) -> list[Ranked]:
     tail = (1.0 - CONFIDENCE) / 2.0
     ends = drawn.quantile([tail, 1.0 - tail])
     apart = _told_apart(means, drawn)
-    found: list[Ranked] = []
+    found = []
     rank = 1
     best = str(means.index[0])  # of those with this rank
     for place, name in enumerate(map(str, means.index), start=1):
@@ -165,7 +164,7 @@ def _by_robot(table: pd.DataFrame, column: str, *, lost: bool = False) -> pd.Dat
     return filled
 
 
-def _rows_of_challenges(by_robot: pd.DataFrame) -> list[npt.NDArray[np.intp]]:
+def _rows_of_challenges(by_robot: pd.DataFrame) -> list[IntArray]:
     """Return the numbers of the rows of each challenge."""
     challenges = by_robot.index.get_level_values("challenge").to_numpy()
     return [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]

@@ -53,7 +53,7 @@ from servobench.harness.config.installation import read_checkout
 from servobench.harness.config.registry import offered
 from servobench.harness.config.settings import default_config, file_stem, flatten
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, write_atomically
+from servobench.plant.contract.files import accessing, write_text
 from servobench.plant.contract.settings import Count, Periods, settings
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
@@ -138,7 +138,7 @@ class Method:
 
     def wanted(self) -> list[Wanted]:
         """Return the points that its studies ask for, after they went on as far as the ledger knows."""
-        wanted: list[Wanted] = []
+        wanted = []
         for each in self.studies:
             each.advance(self.ledger)
             if each.wanted is not None:
@@ -337,7 +337,7 @@ def write_tuned(path: Path, tuned: TunedValues) -> None:
     for record in records:
         text += _table(record, "studies.", "\n[[studies]]\n")
     with accessing(path, "tuned values"):
-        write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+        write_text(path, text)
 
 
 def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
@@ -388,7 +388,7 @@ class Check:
         """
         self._runs = runs
         self._changes: list[tuple[Ledger, list[dict[str, Any]], partial[Change]]] = []
-        points: dict[str, Wanted] = {}
+        points = {}
         for name in controllers:
             config = default_config(find_tunable(name))
             Trial(name, config).build(runs.runs())

@@ -23,11 +23,9 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 """
 
 import math
-import tomllib
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from importlib.resources import files
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -41,6 +39,7 @@ from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import choose_controller, find_controller, offered
 from servobench.harness.config.settings import apply_settings, flatten, nest, tuned_settings
 from servobench.plant.contract.dependence import declared
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.settings import check_field, suggest
@@ -53,9 +52,7 @@ Point: TypeAlias = Mapping[str, Any]
 DIGITS = 3  # significant digits of a tuned number; no study is more precise
 EDGE = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
 WIDER = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
-_TABLES = tomllib.loads(
-    (files("servobench.harness.apps.tuning") / "spaces.toml").read_text(encoding="utf-8")
-)
+_TABLES = read_beside(__file__, "spaces.toml")
 LIMITS: Mapping[str, float] = _TABLES["limits"]
 """Upper ends of boxes that are no choice; a lower end of 0, or of one step, is none either."""
 
@@ -288,8 +285,8 @@ def study(
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sampled = optuna.create_study(direction="minimize")
-    scores: list[float] = []
-    points: list[Point] = []
+    scores = []
+    points = []
     for number in range(trials):
         if number < len(first):
             sampled.enqueue_trial(dict(first[number]))
@@ -362,8 +359,7 @@ def _step(distribution: FloatDistribution | IntDistribution, value: float, sign:
     size = STEP * abs(value) or STEP_FROM_ZERO * distribution.high
     if distribution.step is not None:
         size = distribution.step * max(1, round(size / distribution.step))
-    moved: float = _within(distribution, value + sign * size, value)
-    return moved
+    return _within(distribution, value + sign * size, value)
 
 
 def neighbours(space: Space, values: Point) -> list[tuple[str, Point]]:

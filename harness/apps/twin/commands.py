@@ -16,7 +16,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, option
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, user_path, write_atomically, write_csv
+from servobench.plant.contract.files import accessing, user_path, write_csv, write_text
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -215,7 +215,7 @@ def _write_twin(answer: Answer, request: RunRequest, out: Path) -> None:
     with accessing(out):
         named = (with_files(request.robot, beside), request.sensing)
         text = twin_text(answer.robot, answer.log, answer.response, named, answer.held)
-        write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+        write_text(out, text)
 
 
 def _say_next(twin: Path, period: float) -> None:

@@ -102,7 +102,7 @@ class _Drive(NamedTuple):
         bound = level[0] if level else self.limit
         clipped = np.clip(self.commands, -bound, bound)
         errors = self.steps - joint_steps(clipped, self.period, delay, lag)
-        return np.asarray(errors[self.first :].ravel())
+        return errors[self.first :].ravel()
 
     def fit(self, *level: float) -> Any:  # noqa: ANN401 - of SciPy
         """Return the least squares, from the best of a grid of delays and lags; a level stays within a factor of 2."""
@@ -180,7 +180,7 @@ def _correlations(values: FloatArray, others: FloatArray) -> FloatArray:
     values = values - values.mean(axis=0)
     others = others - others.mean(axis=0)
     sizes = np.linalg.norm(values, axis=0)[:, None] * np.linalg.norm(others, axis=0)
-    return np.asarray(values.T @ others / np.maximum(sizes, 1e-9))
+    return values.T @ others / np.maximum(sizes, 1e-9)
 
 
 def joint_steps(commands: FloatArray, period: float, delay: float, lag: float) -> FloatArray:
@@ -207,4 +207,4 @@ def joint_steps(commands: FloatArray, period: float, delay: float, lag: float) -
     driven = second * (1.0 - first) * before + (1.0 - second) * now
     v = lfilter([1.0], [1.0, -kept], driven, axis=0)
     change = np.diff(v, axis=0, prepend=0.0)
-    return np.asarray(rest * before + (period - rest) * now - lag * change)
+    return rest * before + (period - rest) * now - lag * change

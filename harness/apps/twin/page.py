@@ -32,7 +32,7 @@ from servobench.harness.apps.report.page import Picture, page_policy, page_style
 from servobench.harness.apps.twin.identification import Log
 from servobench.harness.apps.twin.summary import Answer, estimates, handy, held_out_line, remarks
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.files import write_text
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.twin import deviated
 
@@ -87,7 +87,7 @@ def write_page(answer: Answer, path: Path) -> None:
         wide=f"{usual:.2g}",
         worst=f"{largest:.2g}",
     )
-    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
+    write_text(path, text)
 
 
 def postures_about(log: Log) -> FloatArray:
@@ -97,7 +97,7 @@ def postures_about(log: Log) -> FloatArray:
     half = 0.5 * REGION * (highest - lowest)
     shares = np.random.default_rng(0).uniform(-1.0, 1.0, (POSTURES, log.joints.shape[1]))
     drawn = 0.5 * (lowest + highest) + half * shares
-    return np.asarray(np.clip(drawn, log.spec.joint_lower, log.spec.joint_upper))
+    return np.clip(drawn, log.spec.joint_lower, log.spec.joint_upper)
 
 
 def region_of(answer: Answer, joints: FloatArray) -> Region:

@@ -127,7 +127,7 @@ def noise_of(log: Log) -> FloatArray:
     if not successive.size:
         return np.zeros(log.spec.m)
     third = np.diff(log.features[rows], n=3, axis=0)[successive]
-    return np.asarray(1.4826 * np.median(np.abs(third), axis=0) / math.sqrt(20.0))
+    return 1.4826 * np.median(np.abs(third), axis=0) / math.sqrt(20.0)
 
 
 def is_explained(log: Log, robot: Identified) -> bool:
@@ -138,7 +138,7 @@ def is_explained(log: Log, robot: Identified) -> bool:
 def _above_noise(log: Log, robot: Identified) -> BoolArray:
     """Return which features have residuals far above the noise, (m,)."""
     spread = np.sqrt(np.diag(robot.noise))
-    return np.asarray(spread > MAX_NOISE_RATIO * noise_of(log))
+    return spread > MAX_NOISE_RATIO * noise_of(log)
 
 
 def _is_noise(log: Log, robot: Identified) -> bool:
@@ -157,7 +157,7 @@ def _explains_more(one: Identified, other: Identified) -> bool:
 def _shares(log: Log, robot: Identified) -> FloatArray:
     """Return the errors of a feature over its motion, (m,)."""
     motion = np.std(log.features[robot.rows], axis=0).max()
-    return np.asarray(np.sqrt(np.diag(robot.noise)) / motion)
+    return np.sqrt(np.diag(robot.noise)) / motion
 
 
 def _units(log: Log, model: RobotModel) -> str:
@@ -178,7 +178,7 @@ def _units(log: Log, model: RobotModel) -> str:
 def _spread(values: FloatArray) -> FloatArray:
     """Return the robust standard deviation of values (k, m), by the median of their distances from the median: (m,)."""
     distances = np.abs(values - np.median(values, axis=0))
-    return np.asarray(1.4826 * np.median(distances, axis=0))
+    return 1.4826 * np.median(distances, axis=0)
 
 
 def _large_errors(log: Log, robot: Identified) -> str:
@@ -289,7 +289,7 @@ def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[
     if known:
         stages = [(_remedies, TIE_RATIO)]
     least = as_it_is
-    names: list[str] = []
+    names = []
     for remedies, gain in stages:
         fits = []
         for *_, remedy in nsmallest(SCREENED, _placed(remedies(log, model, others), rows)):
@@ -318,7 +318,7 @@ def _fit(remedy: _Remedy, begin: Mapping[str, float] | None = None) -> Identifie
 def _noise_for_misfits(log: Log) -> FloatArray:
     """Return the deviation of a feature's noise, (m,), or a small share of the motion where that is more."""
     rows = frames_of(log, FRAMES)
-    return np.asarray(np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max()))
+    return np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
 
 
 def _misfit(robot: Identified, noise: FloatArray) -> float:

@@ -33,7 +33,7 @@ def twin_text(
     own = [k for k, name in enumerate(robot.names) if name not in EXTRAS]
     names = [robot.names[k] for k in own]
     factor = robot.factor[:, own]
-    mean: dict[str, float] = {}
+    mean = {}
     for k, name in zip(own, names, strict=True):
         if name != "latency" and not name.startswith("camera"):
             mean[name] = float(robot.values[k])
@@ -43,7 +43,7 @@ def twin_text(
         factor = _with_times(factor, response.covariance)
         names += TIMES[1:]
     measured = sensor(log, robot)
-    top: dict[str, Any] = {
+    top = {
         "robot": named[0],
         "sensing": named[1],
         "covariance": measured.noise,

@@ -125,6 +125,22 @@ def test_settings_are_read_from_a_folder_that_counts_probing_in_periods(tmp_path
     np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
 
 
+def test_a_folder_may_name_settings_that_are_gone_with_the_values_that_stay(tmp_path):
+    compare(
+        ["mpc+kalman"],
+        tasks=["exp2"],
+        seeds=[3],
+        settings={"exp2": {"duration": 1.0}},
+        out=tmp_path / "runs",
+    )
+    manifest = ResultsFolder(tmp_path / "runs").manifest
+    gone = {"law.solver": "daqp", "estimator.form": "split"}
+    manifest["configuration"]["mpc+kalman"].update(gone)
+    store.write_manifest(tmp_path / "runs", manifest)
+    resolved, steps = logged_in_folder(ResultsFolder(tmp_path / "runs"), None, None)
+    np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
+
+
 def test_a_log_at_the_rate_of_its_camera_gets_no_remark_on_frames(steps, tmp_path, caplog):
     camera = tmp_path / "camera.toml"
     camera.write_text(
