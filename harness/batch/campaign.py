@@ -70,6 +70,7 @@ class Campaign:
     steps: bool = False  # keep the table of steps, too
     timed: bool = False  # each run goes by itself, so that its steps have times
     metrics: tuple[str, ...] = ()  # names of metrics of users; each run goes by itself, too
+    on_tuning_seeds: bool = False  # it may have robots on which methods were tuned, for an audit
     looks: Looks | None = None  # when it may end before all runs; None for a fixed number
 
 
@@ -247,7 +248,8 @@ def check_campaign(
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used, or a seed that is kept for tuning.
     """
-    refuse_tuning_seeds(chain.from_iterable(runs.seeds))
+    if not campaign.on_tuning_seeds:
+        refuse_tuning_seeds(chain.from_iterable(runs.seeds))
     check_settings(campaign.settings, runs.sections)
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)

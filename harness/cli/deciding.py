@@ -52,19 +52,24 @@ def ask(
     return Question.ask(names, against, worlds, seeds)
 
 
-def ending_when_decided(campaign: Campaign, question: Question) -> Campaign:
+def ending_when_decided(
+    campaign: Campaign,
+    question: Question,
+    find_answers: Callable[[pd.DataFrame, Question], list[Answer]] = decide_worlds,
+) -> Campaign:
     """Return a campaign that ends when its question is decided.
 
     Args:
         campaign: with all runs of the budget.
         question: what it is to decide.
+        find_answers: returns from the table of runs what is decided.
     """
     cells, ends = in_looks(campaign.cells, question.seeds, question.looks)
 
     def goes_on(runs: pd.DataFrame) -> Callable[[RunRequest], bool]:
         answers = []
         if not runs.empty:
-            answers = decide_worlds(runs, question)
+            answers = find_answers(runs, question)
         return needed_after(answers, question)
 
     return replace(campaign, cells=cells, looks=Looks(ends, goes_on, question.record()))

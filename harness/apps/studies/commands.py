@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import PLANT, Value, option
+from servobench.harness.cli.options import PLANT, Value, option, switch
 from servobench.harness.cli.results import judge, print_lacking
 from servobench.harness.cli.selection import Names, accepted
 from servobench.harness.cli.terminal import console, print_tables, say
-from servobench.plant.contract.files import split_words
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import split_words, write_csv
 
 DEFAULT_CONTROLLERS = (
     "regression_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
@@ -89,6 +90,15 @@ def suite(
             "COUNT", "Robots on which references run and scores are given; default: all.", min=1
         ),
     ] = None,
+    until_decided: options.UntilDecidedOption = False,
+    against: options.AgainstOption = None,
+    audit: Annotated[
+        bool,
+        switch(
+            "--audit",
+            "Also say what the suite is worth: shortcuts, significance, overfitting, sources.",
+        ),
+    ] = False,
     metric: options.MetricsOption = None,
     running: options.Running,
     overrides: options.Overrides,
@@ -98,10 +108,12 @@ def suite(
     A score is the error or time of a method that knows the true robot over that of the method; a lost run has 0.
     """
     from servobench.harness.analysis.folder import describe_tuning, mark_tuned
+    from servobench.harness.apps.studies import audit as diagnostics
     from servobench.harness.apps.studies.challenge import GRADES, choose_challenges
     from servobench.harness.apps.studies.suite import carry_out_suite, suite_tables
     from servobench.harness.batch.plan import parse_seeds
     from servobench.harness.batch.results import ResultsFolder
+    from servobench.harness.cli.deciding import ask
     from servobench.harness.cli.progress import watching
 
     grades = split_words(grade)
@@ -109,17 +121,40 @@ def suite(
         grades = GRADES  # the rankings of pages and stored tables have graded ones alone
     words = selection.split(_challenges, challenges, option="challenges")
     worlds = choose_challenges(words, grades)
-    names = selection.split("controllers", controllers)
+    if audit and until_decided:
+        raise ConfigurationError(
+            "--audit needs all robots, and --until-decided leaves some out; give one of them"
+        )
+    methods = selection.split("controllers", controllers)
+    names = methods
+    if audit:
+        names = diagnostics.with_probes(methods)
     where = selection.split("plants", plants) if plants else ()
     robots = parse_seeds(seeds)
     metrics = selection.choose_metrics(metric)
+    settings = overrides.settings()
     runs = {world.name: world.cells(where, names, robots, reference_seeds) for world in worlds}
+    count = sum(len(where or world.plants) for world in worlds)
+    question = ask(until_decided, against, names, count, robots)
     with watching(console, out, running.execution()) as how:
-        judged = carry_out_suite(out, worlds, runs, overrides.settings(), how, metrics)
+        judged = carry_out_suite(out, worlds, runs, settings, how, metrics, question)
+        if audit:
+            robots = diagnostics.robots_of_tuning(judged)
+            runs = {
+                world.name: world.cells(where, methods, robots, len(robots)) for world in worlds
+            }
+            tuned = carry_out_suite(
+                out / diagnostics.ROBOTS, worlds, runs, settings, how, on_tuning_seeds=True
+            )
+            found = diagnostics.audit(judged, tuned, worlds)
+            write_csv(found, out / diagnostics.AUDIT)
     for world in worlds:
         print_lacking(ResultsFolder(out / world.name))
     manifest = ResultsFolder(out / worlds[0].name).manifest
     shown = mark_tuned(judged, manifest)
     print_tables(suite_tables(shown), "score: reference over method, at most 1; 0 for a lost run")
     say("\n".join(describe_tuning(manifest)))
+    if audit:
+        legend = f"scores from {diagnostics.SOLVED:g} of the best on solve a challenge"
+        print_tables([("audit", found)], legend)
     say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")

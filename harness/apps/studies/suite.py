@@ -10,6 +10,7 @@ grade and no part in the ranking.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +20,27 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import (
     column_of,
+    margin,
     median_with_interval,
     outcomes,
     success_rate,
 )
+from servobench.harness.analysis.decisions import (
+    DECISIONS,
+    EVERY,
+    Answer,
+    Question,
+    answer,
+    answer_table,
+)
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.apps.figures import style
+from servobench.harness.apps.studies.audit import mark_solved
 from servobench.harness.apps.studies.challenge import MEASURES, Challenge
 from servobench.harness.apps.studies.scores import profile, ranking, resolution, scores
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
+from servobench.harness.cli.deciding import ending_when_decided, print_answers
 from servobench.harness.config.registry import DECLARED, offered
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.metrics import METRICS
@@ -56,6 +68,9 @@ def carry_out_suite(
     settings: Settings,
     how: Execution,
     metrics: tuple[str, ...] = (),
+    question: Question | None = None,
+    *,
+    on_tuning_seeds: bool = False,
 ) -> pd.DataFrame:
     """Carry out the runs of challenges, judge them, write tables and pictures, and return the judged runs.
 
@@ -66,6 +81,8 @@ def carry_out_suite(
         settings: overrides of the defaults of methods and worlds.
         how: how the runs are carried out.
         metrics: names of metrics of users, which are shown beside the scores.
+        question: what is to be decided; None for all runs.
+        on_tuning_seeds: whether robots are those on which methods were tuned, for an audit.
 
     Raises:
         ConfigurationError: settings that nothing reads or that a challenge fixes, or as `carry_out_parts`.
@@ -80,11 +97,28 @@ def carry_out_suite(
     sections = resolve_sections(requests, whole)
     for request in requests:
         select(request, sections)  # all challenges are checked before the first one runs
-    campaigns = {name: Campaign(own, whole, metrics=metrics) for name, own in runs.items()}
+    campaigns = {
+        name: Campaign(own, whole, metrics=metrics, on_tuning_seeds=on_tuning_seeds)
+        for name, own in runs.items()
+    }
+    if question is not None:
+        for each in challenges:
+            find = partial(challenge_answers, each)
+            campaigns[each.name] = ending_when_decided(campaigns[each.name], question, find)
     tables = carry_out_parts(campaigns, out, how)
     declare_metrics({each.name: each.entry.record() for each in offered(metrics)})
     parts = [judge(challenge, tables[challenge.name]) for challenge in challenges]
-    judged = pd.concat(parts, ignore_index=True)
+    if question is not None:
+        answers = []
+        for each in challenges:
+            answers += challenge_answers(each, tables[each.name], question)
+        budget = sum(map(len, runs.values()))
+        print_answers(answers, question, sum(map(len, tables.values())), budget)
+        write_csv(answer_table(answers), out / DECISIONS)
+        parts = [
+            shared_robots(judged, each) for each, judged in zip(challenges, parts, strict=True)
+        ]
+    judged = mark_solved(pd.concat(parts, ignore_index=True), challenges)
     write_csv(judged, out / RUNS)
     _write_rows(methods_rows(judged), out / METHODS)
     _write_rows(ranking_rows(judged), out / RANKING)
@@ -98,13 +132,37 @@ def _write_rows(rows: list[Row], path: Path) -> None:
     write_csv(pd.json_normalize(as_plain(rows)), path)
 
 
+def challenge_answers(challenge: Challenge, runs: pd.DataFrame, question: Question) -> list[Answer]:
+    """Return what the runs of a challenge decide, by its measure; runs that are lost there are lost here."""
+    measure = MEASURES[challenge.measure]
+    judged = judge(challenge, runs)
+    judged = judged.assign(value=judged["value"].fillna(np.inf), run_id=runs["run_id"])
+    answers = []
+    for plant, place in judged.groupby("plant", sort=False):
+        own = runs.loc[place.index]
+        at_first = own[own["seed"].isin(question.seeds[:EVERY])]
+        small = measure.factor * margin(measure.column, at_first)
+        words = f"{challenge.name} on {plant}"
+        answers += answer(place, words, f"{challenge.measure} [{measure.unit}]", small, question)
+    return answers
+
+
+def shared_robots(judged: pd.DataFrame, challenge: Challenge) -> pd.DataFrame:
+    """Return the runs of a challenge on the robots that all methods met, though some may have ended before others."""
+    methods = judged[~judged["controller"].isin(challenge.reference)]
+    met = methods.groupby(["plant", "seed"])["controller"].nunique()
+    kept = met.index[met == met.groupby("plant").transform("max")]
+    robots = pd.MultiIndex.from_frame(judged[["plant", "seed"]])
+    return judged[robots.isin(kept)]
+
+
 def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
     """Return the runs of a challenge with their scores.
 
     Returns:
         A row a run: challenge, grade, plant, controller, seed; `measured` in the unit that is shown, NaN where there is
         none; `value`, the same raised to the floor and NaN of a lost run; `score`, NaN where no reference ran;
-        `reference`, the value of the better one, NaN where it is lost.
+        `reference`, the value of the better one, NaN where it is lost; `solved`, still empty, see `mark_solved`.
     """
     measure = MEASURES[challenge.measure]
     floor = measure.factor * measure.floor
@@ -126,14 +184,18 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
         measured=measured,
         value=value,
         reference=reference,
+        solved="",
         score=np.where(has_reference, scores(value, reference, floor), np.nan),
         **{name: column_of(runs, name) for name in DECLARED},
     )
 
 
 def bounded(judged: pd.DataFrame) -> pd.DataFrame:
-    """Return the scored runs of challenges whose references lose few robots, of methods that were in all of them."""
-    known = judged[judged["score"].notna()]
+    """Return the scored runs of methods that were in all challenges of worth.
+
+    Those are not solved by a shortcut, and their references lose few robots.
+    """
+    known = judged[judged["score"].notna() & (judged["solved"] == "")]
     lost = known.groupby(["challenge", "plant"])["reference"].transform(
         lambda own: own.isna().mean()
     )
@@ -205,6 +267,9 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         grade = about["grade"] or "ungraded"
         if len(scored) > 0 and bounded(scored).empty:
             grade = "no grade, as its references fail"
+        shortcut = judged.loc[is_here, "solved"].iloc[0]
+        if shortcut:
+            grade = f"no grade, as {shortcut} solves it"
         headings = {
             "controller": "controller",
             "runs": "runs",

@@ -8,6 +8,7 @@ import pytest
 
 from kit.command import servobench
 from kit.own import write
+from servobench.harness.analysis.decisions import Question
 from servobench.harness.analysis.tables import as_plain
 from servobench.harness.apps.studies.challenge import (
     GRADES,
@@ -23,10 +24,12 @@ from servobench.harness.apps.studies.suite import (
     RANKING,
     RUNS,
     bounded,
+    challenge_answers,
     draw_suite,
     judge,
     methods_rows,
     ranking_rows,
+    shared_robots,
     suite_tables,
 )
 from servobench.harness.batch import results
@@ -322,3 +325,23 @@ def test_the_command_scores_methods_in_ones_own_world_and_goes_on_where_it_stopp
     assert servobench(monkeypatch, *words, "--resume") == 0
     assert {name: (tmp_path / "suite" / name).read_text() for name in first} == first
     assert "exists already" in refusal_of(*words)
+
+
+def test_a_challenge_is_decided_by_its_measure_and_its_lost_runs():
+    rng = np.random.default_rng(0)
+    base = rng.uniform(0.6, 1.2, 64)
+    never = np.where(np.arange(64) % 4 == 0, -1.0, base)
+    values = {"mine": base, "slow": base + 0.3, "rash": never, "calibrated": base[:16]}
+    runs = table_of(values, "settling_time_s", "point_to_point", 0.005)
+    runs["run_id"] = runs["controller"] + runs["seed"].astype(str)
+    question = Question.ask(["mine", "slow", "rash"], None, 1, range(64))
+    found = challenge_answers(challenge("settling"), runs, question)
+    assert [each.pair for each in found][:2] == [("mine", "slow"), ("mine", "rash")]
+    assert [each.decision.verdict for each in found[:2]] == ["better", "better"]
+    assert [each.decision.told_by_lost for each in found[:2]] == [False, True]
+    assert found[0].margin == 0.05
+    ended = runs[(runs["controller"] != "slow") | (runs["seed"] < 32)]
+    shared = shared_robots(judge(challenge("settling"), ended), challenge("settling"))
+    assert shared.groupby("controller").size().to_dict() == {
+        "calibrated": 16, "mine": 32, "rash": 32, "slow": 32,
+    }  # fmt: skip
