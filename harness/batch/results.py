@@ -168,7 +168,7 @@ class ResultsFolder:
         return steps
 
     def other_tables(self) -> Iterator[tuple[str, pd.DataFrame]]:
-        """Yield name and content of each further table, without runs and steps, such as answered claims.
+        """Yield name and content of each further table, without runs and steps, such as the scores of a suite.
 
         Raises:
             ConfigurationError: one of them cannot be read.
