@@ -36,6 +36,11 @@ APPLICATIONS = {
         "arms and controllers as FMUs", ("fmu",), further=("servobench.fmus.controllers",)
     ),
     "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
+    "board": Application(
+        "results that strangers can check",
+        ("selftest",),
+        "report",
+    ),
     "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
     "studies": Application(
         "claims, challenges and the robustness map", ("robustness", "suite", "claims")
@@ -57,6 +62,7 @@ PANELS = {  # title on the help page -> commands, in the order of first use
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
     "Studies": ("sweep", "analyse", "robustness", "suite", "claims", "tune"),
+    "Results that others check": ("selftest",),
     "Tools": ("train", "collect", "merge", "export", "verify", "fmu"),
 }
 
