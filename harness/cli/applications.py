@@ -38,7 +38,7 @@ APPLICATIONS = {
     "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
     "board": Application(
         "results that strangers can check",
-        ("selftest",),
+        ("selftest", "verify"),
         "report",
     ),
     "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
@@ -54,7 +54,7 @@ APPLICATIONS = {
 }
 CORE = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),
-    "results": ("statistics", "collect", "verify"),
+    "results": ("statistics", "collect"),
     "lists": ("plants", "controllers", "tasks", "sensing", "init"),
 }
 PANELS = {  # title on the help page -> commands, in the order of first use
@@ -62,8 +62,8 @@ PANELS = {  # title on the help page -> commands, in the order of first use
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
     "Studies": ("sweep", "analyse", "robustness", "suite", "claims", "tune"),
-    "Results that others check": ("selftest",),
-    "Tools": ("train", "collect", "merge", "export", "verify", "fmu"),
+    "Results that others check": ("selftest", "verify"),
+    "Tools": ("train", "collect", "merge", "export", "fmu"),
 }
 
 

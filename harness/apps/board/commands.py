@@ -1,14 +1,26 @@
-"""The command `servobench selftest`: results that others can check."""
+"""The commands `servobench selftest | verify`: results that others can check."""
 
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from servobench.harness.cli import selection
 from servobench.harness.cli.options import option
-from servobench.harness.cli.terminal import FAILED, say
+from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
+
+if TYPE_CHECKING:
+    from servobench.harness.apps.board.protocol import Finding, Hear
+    from servobench.harness.batch.results import ResultsFolder
+
+MAX_LEFT_OUT = 10  # files without a checksum that are named
+COLOURS = {"ok": "green", "failed": "bold red", "unknown": "yellow"}
 
 
 def selftest(
@@ -39,3 +51,88 @@ def selftest(
         say(f"{different} of {len(parts)} parts differ from the reference")
         sys.exit(FAILED)
     say("this machine computes bit for bit as the reference did")
+
+
+def verify(
+    folder: Annotated[Path, typer.Argument(help="Results folder.")],
+    rerun: Annotated[
+        int | None,
+        option(
+            "COUNT",
+            "Carry out so many of its runs again, drawn by its hash; all: a larger number.",
+            min=1,
+        ),
+    ] = None,
+    controller: Annotated[
+        list[str] | None,
+        option(
+            "NAME=FILE",
+            "Code of a controller of the folder, a file or a wheel that you trust to be run; may be repeated.",
+        ),
+    ] = None,
+) -> None:
+    """Check a results folder, and carry some of its runs out again.
+
+    Damaged files are named with their remedy. Runs go without network, and with the limits of foreign code. The exit
+    code is 1 if something is wrong.
+    """
+    from servobench.harness.apps.board.code import find_code
+    from servobench.harness.apps.board.verification import Given, draw, recheck
+    from servobench.harness.batch.lock import current_holder
+    from servobench.harness.batch.results import ResultsFolder
+
+    if (holder := current_holder(folder)) is not None:
+        say(f"{folder} is being written by {holder}")
+    if controller and rerun is None:
+        raise ConfigurationError("--controller is the code that --rerun carries out; give both")
+    opened = ResultsFolder(folder)
+    _check_files(opened)
+    if rerun is None:
+        return
+    codes = {}
+    for word in controller or []:
+        name, _, place = word.partition("=")
+        codes[name] = find_code(place)
+    _print_findings(partial(recheck, opened, draw(opened.runs(), rerun), Given(codes)))
+
+
+def _check_files(folder: ResultsFolder) -> None:
+    """Print the damaged files of a folder, and end with exit code 1 if there are some."""
+    from servobench.harness.batch.integrity import examine
+    from servobench.harness.batch.results import missing_line
+    from servobench.plant.contract.settings import listed
+
+    found = examine(folder)
+    for finding in found.findings:
+        say(f"{folder.path / finding.name} {finding.fault}: {finding.remedy}")
+    say(missing_line(found.runs, found.wanted))
+    if found.left_out:
+        names = listed(found.left_out, MAX_LEFT_OUT)
+        say(f"not checked, as SHA256SUMS does not list it: {names}")
+    if found.findings:
+        sys.exit(FAILED)
+    say(f"{found.files} files are as they were written, {found.runs} runs")
+
+
+def _print_findings(check: Callable[[Hear], None]) -> None:
+    """Carry checks out without network, print a line a finding, and end with exit code 1 if one of them is wrong."""
+    from rich.text import Text
+
+    from servobench.harness.apps.board.network import close_network
+    from servobench.harness.apps.board.protocol import CLAUSES
+
+    if not close_network():
+        say("the network stays open: this system cannot close it")
+    verdicts = []
+
+    def hear(finding: Finding) -> None:
+        verdicts.append(finding.verdict)
+        verdict = f"{finding.verdict:8s}", COLOURS[finding.verdict]
+        clause = f"{finding.clause} {CLAUSES[finding.clause]}: "
+        console.print(Text.assemble(verdict, clause, finding.text), soft_wrap=True)
+
+    check(hear)
+    wrong = verdicts.count("failed")
+    say(f"{len(verdicts)} findings: {wrong} wrong, {verdicts.count('unknown')} unknown")
+    if wrong:
+        sys.exit(FAILED)
