@@ -1,4 +1,4 @@
-"""The commands `servobench selftest | verify`: results that others can check."""
+"""The commands `servobench selftest | verify | submit`: results that others can check."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import option
+from servobench.harness.cli.options import FolderOption, Running, option
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import split_words
 
 if TYPE_CHECKING:
     from servobench.harness.apps.board.protocol import Finding, Hear
     from servobench.harness.batch.results import ResultsFolder
 
 MAX_LEFT_OUT = 10  # files without a checksum that are named
+SUBMITTED_RERUNS = 6  # runs of a submission that are repeated where no number is given
 COLOURS = {"ok": "green", "failed": "bold red", "unknown": "yellow"}
 
 
@@ -54,7 +56,7 @@ def selftest(
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(help="Results folder.")],
+    folder: Annotated[Path, typer.Argument(help="Results folder, or a submission.")],
     rerun: Annotated[
         int | None,
         option(
@@ -77,6 +79,7 @@ def verify(
     code is 1 if something is wrong.
     """
     from servobench.harness.apps.board.code import find_code
+    from servobench.harness.apps.board.submission import HEAD
     from servobench.harness.apps.board.verification import Given, draw, recheck
     from servobench.harness.batch.lock import current_holder
     from servobench.harness.batch.results import ResultsFolder
@@ -85,6 +88,11 @@ def verify(
         say(f"{folder} is being written by {holder}")
     if controller and rerun is None:
         raise ConfigurationError("--controller is the code that --rerun carries out; give both")
+    if (folder / HEAD).exists():
+        from servobench.harness.apps.board.examination import check_submission
+
+        _print_findings(partial(check_submission, folder, rerun or SUBMITTED_RERUNS))
+        return
     opened = ResultsFolder(folder)
     _check_files(opened)
     if rerun is None:
@@ -136,3 +144,42 @@ def _print_findings(check: Callable[[Hear], None]) -> None:
     say(f"{len(verdicts)} findings: {wrong} wrong, {verdicts.count('unknown')} unknown")
     if wrong:
         sys.exit(FAILED)
+
+
+def submit(
+    subject: Annotated[
+        str,
+        typer.Argument(
+            metavar="CONTROLLER",
+            help="./mine.py, ./mine.py:Mine, a wheel, or a method of servobench.",
+        ),
+    ],
+    *,
+    out: FolderOption,
+    author: Annotated[str, option("NAME", "Who submits it, for the board.")] = "",
+    kinds: Annotated[
+        str,
+        option(
+            "NAMES",
+            "Comma-separated kinds of worlds: mounting, camera, arm, timing, drive, everything; default: all.",
+        ),
+    ] = selection.ALL,
+    running: Running,
+) -> None:
+    """Pack a controller and judge it on robots that its hash draws.
+
+    The folder is a submission, which verify checks clause by clause.
+    """
+    from servobench.harness.apps.board.protocol import KINDS
+    from servobench.harness.apps.board.submission import submit as make
+    from servobench.harness.cli.progress import watching
+
+    chosen = split_words(kinds)
+    if kinds == selection.ALL:
+        chosen = tuple(KINDS)
+    with watching(console, out, running.execution()) as how:
+        judged = make(subject, out, author, chosen, how)
+    means = judged.groupby(["challenge", "controller"], sort=False)["score"].mean()
+    for _, world, name, score in means.reset_index().itertuples():
+        say(f"{world:20s} {name:20s} {score:.2f}")
+    say(f"mean scores; next: servobench verify {out}")
