@@ -38,7 +38,7 @@ APPLICATIONS = {
     "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
     "board": Application(
         "results that strangers can check",
-        ("selftest", "verify", "submit"),
+        ("selftest", "verify", "submit", "leaderboard"),
         "report",
     ),
     "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
@@ -62,7 +62,7 @@ PANELS = {  # title on the help page -> commands, in the order of first use
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
     "Studies": ("sweep", "analyse", "robustness", "suite", "claims", "tune"),
-    "Results that others check": ("selftest", "verify", "submit"),
+    "Results that others check": ("selftest", "verify", "submit", "leaderboard"),
     "Tools": ("train", "collect", "merge", "export", "fmu"),
 }
 

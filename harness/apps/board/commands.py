@@ -1,4 +1,4 @@
-"""The commands `servobench selftest | verify | submit`: results that others can check."""
+"""The commands `servobench selftest | verify | submit | leaderboard`: results that others can check."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import FolderOption, Running, option
+from servobench.harness.cli.options import FolderOption, Running, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import split_words
@@ -168,7 +168,7 @@ def submit(
 ) -> None:
     """Pack a controller and judge it on robots that its hash draws.
 
-    The folder is a submission, which verify checks clause by clause.
+    The folder is a submission, which verify checks clause by clause and leaderboard shows.
     """
     from servobench.harness.apps.board.protocol import KINDS
     from servobench.harness.apps.board.submission import submit as make
@@ -183,3 +183,19 @@ def submit(
     for _, world, name, score in means.reset_index().itertuples():
         say(f"{world:20s} {name:20s} {score:.2f}")
     say(f"mean scores; next: servobench verify {out}")
+
+
+def leaderboard(
+    folders: Annotated[list[Path], typer.Argument(help="Submissions.")],
+    *,
+    out: Annotated[
+        Path, named_option("--out", "FOLDER", "Folder for the site; files in it are replaced.")
+    ],
+) -> None:
+    """Write a static page that ranks submissions.
+
+    A table for each kind of world and division, with intervals, shared ranks, reports and pictures.
+    """
+    from servobench.harness.apps.board.site import write_site
+
+    say(f"the board is {write_site(folders, out)}")

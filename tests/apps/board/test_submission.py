@@ -1,19 +1,22 @@
-"""Submissions: an honest one keeps all clauses, a changed one breaks one that is named."""
+"""Submissions: an honest one keeps all clauses, a changed one breaks one that is named, and the board ranks them."""
 
+import html
 import json
 import re
 import shutil
 import zipfile
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from kit.command import python
+from kit.command import python, servobench
 from kit.own import WHOLE, write
 from servobench.harness.apps.board import protocol
 from servobench.harness.apps.board.examination import check_submission
 from servobench.harness.apps.board.protocol import CLAUSES, COLUMNS
+from servobench.harness.apps.board.site import rank, read_entries, write_site
 from servobench.harness.apps.board.submission import PACK, RUNS, Submission, submit
 from servobench.harness.batch.campaign import Execution
 from servobench.harness.batch.results import RUNS as TABLE
@@ -197,3 +200,54 @@ def test_a_controller_in_a_wheel_is_packed_run_and_verified(tmp_path):
     assert said.returncode == 0, said
     assert said.stdout.count("ok\n") >= 6  # the version is unknown where the checkout has changes
     assert "failed" not in said.stdout
+
+
+def test_a_second_submission_stands_beside_the_first(honest, copied, tmp_path):
+    rewrite_head(copied, created="2099-01-01T00:00:00+00:00")
+    again = copied.rename(tmp_path / "again")
+    entries = read_entries([again, honest])
+    assert [each.order for each in entries.values()] == ["no. 1 of 2", "no. 2 of 2"]
+    assert list(entries) == ["it", "again"]
+    (table,) = rank(entries.values())
+    assert [row.rank for row in table.rows] == [1, 1]
+
+
+def ranked(entry, scores):
+    """Rank submissions with these scores on many robots."""
+    runs = pd.concat([entry.scores] * 20, ignore_index=True)
+    parts = [
+        replace(entry, key=str(place), scores=runs.assign(score=score))
+        for place, score in enumerate(scores)
+    ]
+    (table,) = rank(parts)
+    return [(row.rank, row.controller, row.lost) for row in table.rows]
+
+
+def test_clearly_different_scores_are_told_apart(honest):
+    entry = read_entries([honest])["it"]
+    spread = np.linspace(0.0, 0.05, 40)
+    rows = ranked(entry, [0.2 + spread, 0.9 + spread, 0.201 + spread[::-1]])
+    assert rows == [(1, "1", 0.0), (2, "2", 0.0), (2, "0", 0.0)]
+
+
+def test_methods_that_lose_every_run_share_a_rank_and_change_no_other(honest):
+    entry = read_entries([honest])["it"]
+    rows = ranked(entry, [0.0, 0.5, 0.0])
+    assert rows == [(1, "1", 0.0), (2, "0", 1.0), (2, "2", 1.0)]
+
+
+def test_the_page_of_the_board_stands_alone_beside_its_reports(honest, tmp_path):
+    page = write_site([honest], tmp_path / "site")
+    text = html.unescape(page.read_text())
+    assert "default-src 'none'" in text
+    links = re.findall(r'href="([^"#:]+\.html)"', text)
+    assert links == [f"it/{WORLD}.html"]
+    assert (tmp_path / "site" / links[0]).is_file()
+    assert not re.search(r'(src|href)="(https?:)?//', text)
+
+
+def test_a_board_of_no_submission_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "nothing").mkdir()
+    assert servobench(monkeypatch, "leaderboard", "nothing", "--out", "site") == 2
+    assert "submission.toml" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
