@@ -3,10 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= results/pages
+METHODS ?= calibrating_mfac regression_mfac rbfnn_mfac ukf_mfac ukf_mpc rbf_pid rbfnn_mfac:published ukf_mfac:published
 unexport PYTHONDONTWRITEBYTECODE  # some containers set it, and each of many processes would compile the package anew
 NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
-.PHONY: run check test lowest results nightly golden lint format tables docs release benchmark lock clean
+.PHONY: run check test lowest results board nightly golden lint format tables docs release benchmark lock clean
 
 # Six controllers on six robots, tables, a report with pictures of a rendered run, and what was found: the last lines.
 run: $(VENV)/ready
@@ -32,6 +33,12 @@ lowest:
 # ONLY=held_out,rates renews these, RUNS is the folder of the runs. CONTRIBUTING.md lists the studies.
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
+
+# The board of the methods in the pages, build/board/index.html; its submissions go on after an interruption.
+board: $(VENV)/ready
+	for name in $(METHODS); do $(BIN)/servobench submit $$name --author servobench --resume \
+	  --out results/board/$$(echo $$name | tr : .) || exit 1; done
+	$(BIN)/servobench leaderboard results/board/* --out build/board
 
 # Too long for every change: whether each block of the first pages runs and all methods do what some do in make test, whether the stored figures of these studies come out again,
 # whether FMPy runs exported loops as the harness does, whether a sweep with hostile controllers loses no run, and whether the unit

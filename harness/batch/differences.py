@@ -18,6 +18,7 @@ VERSIONS = {
     "packages": "packages",
     "engines": "engines",
     "blas": "BLAS",
+    "fingerprint": "arithmetic",
 }
 SHOWN = 60  # letters of a value that a message holds
 

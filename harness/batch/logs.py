@@ -1,6 +1,7 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from servobench.harness.config.registry import FILES
 from servobench.harness.config.settings import Settings, flatten, nest
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections
-from servobench.harness.run.variations import varied_in_row
+from servobench.harness.run.variations import Row, varied_in_row
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import TIME, numbers_of, read_table
@@ -85,12 +86,35 @@ def logged_in_folder(
             that cannot be made ready here.
     """
     row = find_run(folder, run_id)
+    run = run_in_folder(folder, row, controller, (sensing,))
+    steps = folder.steps([row["run_id"]])
+    if steps.empty:
+        raise ConfigurationError(
+            f"run {row['run_id']} has no steps: it ended before its first period"
+        )
+    return run, steps
+
+
+def run_in_folder(
+    folder: ResultsFolder, row: Row, controller: str | None, named: Collection[str] = ()
+) -> ResolvedRun:
+    """Return a run of a results folder.
+
+    Args:
+        folder: of results.
+        row: of the run in the table of runs.
+        controller: as above.
+        named: controllers and set-ups that the user names, which may be code.
+
+    Raises:
+        ConfigurationError: its row names code that the user did not name, or it cannot be made ready here.
+    """
     manifest = folder.manifest
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
         name = str(row.get(word, ""))
         # Code of users may have any name.
         place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")
-        if place or (CODE.search(name) and name != sensing):
+        if name not in named and (place or CODE.search(name)):
             remedy = (
                 "nothing that a folder names is run"
                 if word == "plant"
@@ -99,11 +123,6 @@ def logged_in_folder(
             raise ConfigurationError(
                 f"{folder.path} names code that would be run, {word} {place or name}; {remedy}"
             )
-    steps = folder.steps([row["run_id"]])
-    if steps.empty:
-        raise ConfigurationError(
-            f"run {row['run_id']} has no steps: it ended before its first period"
-        )
     names = ("plant", "task", "mismatch", "robot", "sensing")
     own = row.get("robot") == OWN_ROBOT  # which comes with the plant
     asked = {name: row[name] for name in names if name in row and not (own and name == "robot")}
@@ -114,7 +133,7 @@ def logged_in_folder(
     request = RunRequest(
         controller=controller or row["controller"], seed=int(row["seed"]), varied=varied, **asked
     )
-    return resolve(request, _settings_of(request, manifest, own=not controller)), steps
+    return resolve(request, _settings_of(request, manifest, own=not controller))
 
 
 def _settings_of(request: RunRequest, manifest: Manifest, *, own: bool) -> Settings:

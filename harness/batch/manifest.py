@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from servobench.harness.batch.fingerprint import fingerprint
 from servobench.harness.batch.plan import Survey
 from servobench.harness.batch.schema import Manifest
 from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
@@ -107,6 +108,8 @@ def describe_batch(
         "engines": engines,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "blas": blas_libraries(),
+        "libm": " ".join(platform.libc_ver()),
+        "fingerprint": fingerprint(runs.plants, runs.controllers),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "git_commit": commit,

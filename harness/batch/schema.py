@@ -15,12 +15,12 @@ SCHEMA_VERSION = "4"
 CHANGES = {"3": "; the column latency_periods [periods] is now latency_s [s]"}
 # Types of entries, and of their elements -> the keys of such entries
 ENTRIES: dict[tuple[type, ...], tuple[str, ...]] = {
-    (str,): ("created", "python", "platform", "campaign", "seeds"),
+    (str,): ("created", "libm", "python", "platform", "campaign", "seeds"),
     (int,): ("run_count",),
     (dict,): ("changed", "packages", "engines", "until_decided"),
     (list, str): ("plants", "controllers", "tasks", "mismatches"),
     (list, dict): ("robots", "blas"),
-    (dict, str): ("files",),
+    (dict, str): ("files", "fingerprint"),
     (dict, list): ("side_by_side",),
     (dict, dict): ("configuration", "own_controllers", "own_plants", "own_tasks", "own_metrics", "plugins", "tuned"),
 }  # fmt: skip

@@ -36,6 +36,11 @@ APPLICATIONS = {
         "arms and controllers as FMUs", ("fmu",), further=("servobench.fmus.controllers",)
     ),
     "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
+    "board": Application(
+        "results that strangers can check",
+        ("selftest", "verify", "submit", "leaderboard"),
+        "report",
+    ),
     "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
     "studies": Application("challenges and the robustness map", ("robustness", "suite")),
     "figures": Application("pictures of a results folder, drawn from its tables", ("figures",)),
@@ -47,7 +52,7 @@ APPLICATIONS = {
 }
 CORE = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),
-    "results": ("statistics", "collect", "verify"),
+    "results": ("statistics", "collect"),
     "lists": ("plants", "controllers", "tasks", "sensing", "init"),
 }
 PANELS = {  # title on the help page -> commands, in the order of first use
@@ -55,7 +60,8 @@ PANELS = {  # title on the help page -> commands, in the order of first use
     "Your own controller": ("new", "check", "shadow", "identify", "serve"),
     "What there is": ("plants", "controllers", "tasks", "sensing", "init"),
     "Studies": ("sweep", "analyse", "robustness", "suite", "tune"),
-    "Tools": ("train", "collect", "merge", "export", "verify", "fmu"),
+    "Results that others check": ("selftest", "verify", "submit", "leaderboard"),
+    "Tools": ("train", "collect", "merge", "export", "fmu"),
 }
 
 

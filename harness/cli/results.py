@@ -1,4 +1,4 @@
-"""The commands on results folders: `statistics | collect | verify`; the verdict on failed runs."""
+"""The commands on results folders: `statistics | collect`; the verdict on failed runs."""
 
 from __future__ import annotations
 
@@ -133,29 +133,6 @@ def collect(
         count = store.collect(opened)
     say(opened.describe_missing())
     say(f"{count} runs in {folder / RUNS}")
-
-
-def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
-    """Check the files of a results folder by their checksums.
-
-    Names each damaged file and its remedy. The exit code is 1 if there is one.
-    """
-    from servobench.harness.batch.integrity import examine
-    from servobench.harness.batch.lock import current_holder
-    from servobench.harness.batch.results import ResultsFolder, missing_line
-    from servobench.plant.contract.settings import listed
-
-    if (holder := current_holder(folder)) is not None:
-        say(f"{folder} is being written by {holder}")
-    found = examine(ResultsFolder(folder))
-    for finding in found.findings:
-        say(f"{folder / finding.name} {finding.fault}: {finding.remedy}")
-    say(missing_line(found.runs, found.wanted))
-    if found.left_out:
-        say(f"not checked, as SHA256SUMS does not list it: {listed(found.left_out, MAX_FAULTS)}")
-    if found.findings:
-        sys.exit(FAILED)
-    say(f"{found.files} files are as they were written, {found.runs} runs")
 
 
 def say_methods(manifest: Manifest, names: Mapping[str, str] | None = None) -> None:

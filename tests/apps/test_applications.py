@@ -58,4 +58,4 @@ def test_a_command_loads_no_application_but_its_own(name):
 
 def test_a_command_is_found_in_its_room():
     assert home_of("suite") == "servobench.harness.apps.studies.commands"
-    assert find_command("verify").__module__ == "servobench.harness.cli.results"
+    assert find_command("collect").__module__ == "servobench.harness.cli.results"

@@ -38,6 +38,9 @@ ONLY_READ = {
     "identify": "needs a log; tests/harness/test_identification.py identifies some",
     "shadow": "needs a logged run; tests/harness/test_shadow.py shows some",
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
+    "submit": "takes minutes; tests/apps/board submits on few robots",
+    "leaderboard": "needs submissions, which tests/apps/board makes",
+    "selftest": "needs the arithmetic of the reference; tests/apps/board compares it",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
 # Files of the reader

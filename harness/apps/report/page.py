@@ -139,10 +139,10 @@ def report_pictures(folder: ResultsFolder, runs: pd.DataFrame) -> list[Picture]:
 
 def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
     views = path_views(folder, runs)
-    style = page_style()
-    scripts = [_asset("report.js")]
+    style = page_asset("report.css")
+    scripts = [page_asset("tables.js"), page_asset("report.js")]
     if views:
-        scripts.append(_asset("space.js"))
+        scripts.append(page_asset("space.js"))
     shown = _shown(runs)
     numbered = tables.runs_table(shown)
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
@@ -189,13 +189,9 @@ def page_template(name: str, folder: Path = OWN) -> Template:
     return environment.get_template(name)
 
 
-def _asset(name: str) -> str:
+def page_asset(name: str) -> str:
+    """Return the text of a style or script that pages share."""
     return (OWN / name).read_text(encoding="utf-8")
-
-
-def page_style() -> str:
-    """Return the style of pages."""
-    return _asset("report.css")
 
 
 def page_policy(style: str, scripts: list[str]) -> str:

@@ -28,7 +28,7 @@ from servobench.harness.apps.figures.style import (
     label_rows,
     panel_grid,
 )
-from servobench.harness.apps.report.page import Picture, page_policy, page_style, page_template
+from servobench.harness.apps.report.page import Picture, page_asset, page_policy, page_template
 from servobench.harness.apps.twin.identification import Log
 from servobench.harness.apps.twin.summary import Answer, estimates, handy, held_out_line, remarks
 from servobench.plant.contract.checks import FloatArray
@@ -59,7 +59,7 @@ class Region(NamedTuple):
 
 def write_page(answer: Answer, path: Path) -> None:
     """Write the page of a twin."""
-    style = page_style()
+    style = page_asset("report.css")
     template = page_template(TEMPLATE, OWN)
     template.globals.update(long_table=LONG_TABLE, published=PUBLISHED, tuned={}, region=REGION)
     unit, scale = handy(answer.log)

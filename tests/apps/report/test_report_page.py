@@ -396,7 +396,7 @@ def test_hostile_texts_stay_texts(browser, tmp_path):
     browser.wait_for("document.querySelector('tr.detail')")
     assert browser.evaluate("window.pwned") is None
     assert browser.evaluate("document.querySelectorAll('img:not(.drawn)').length") == 0
-    assert browser.evaluate("document.querySelectorAll('script').length") == 3
+    assert browser.evaluate("document.querySelectorAll('script').length") == 4
     assert HOSTILE in browser.evaluate("document.body.textContent")
     assert browser.complaints() == []
 

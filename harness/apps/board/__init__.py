@@ -1,0 +1,1 @@
+"""Results that strangers can check: the self-test of a machine, verification, submissions and a board."""
