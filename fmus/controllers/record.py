@@ -6,9 +6,7 @@ all modules of this package but its FMUs.
 """
 
 import ctypes
-import hashlib
 import inspect
-import json
 import sys
 import tempfile
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
@@ -41,7 +39,7 @@ from servobench.fmus.controllers.functions import carry_out
 from servobench.fmus.controllers.program import STORE, Node, add, block, source
 from servobench.fmus.product import committed
 from servobench.plant.contract import checks, lanes
-from servobench.plant.contract.cache import COMPILED, cached
+from servobench.plant.contract.cache import COMPILED, cached, key_of
 from servobench.plant.contract.checks import FloatArray
 
 Inputs: TypeAlias = Mapping[str, Any]
@@ -49,6 +47,7 @@ Shapes: TypeAlias = Mapping[str, tuple[tuple[int, ...], str]]
 PACKAGE = "servobench."
 OWN = "servobench.fmus."
 HEADERS = ("controller.h", "linear_algebra.h")
+SOURCES = ("controller.c", "side_by_side.c")
 # Numbers do not depend on the level of optimisation, and the functions are called from Python.
 CHECKED = ("-O1", "-fvisibility=default")
 # The loop over systems side by side
@@ -219,19 +218,16 @@ class Recorded:
         target = this_platform()
         name = f"controller{target.suffix}"
         loop = SIDE_BY_SIDE.format(self.states, self.inputs, self.outputs)
-        files = {header: committed("controller", header) for header in HEADERS}
-        files["controller.c"] = self.source
-        files["side_by_side.c"] = loop
+        files = dict(zip(SOURCES, (self.source, loop), strict=True))
+        files |= {header: committed("controller", header) for header in HEADERS}
 
         def make(folder: Path) -> None:
             with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as sources:
                 for file, text in files.items():
                     Path(sources, file).write_text(text, encoding="utf-8")
-                compiled = [file for file in files if file.endswith(".c")]
-                compile_library(Path(sources), compiled, target, folder / name, self.flags)
+                compile_library(Path(sources), SOURCES, target, folder / name, self.flags)
 
-        parts = json.dumps([files, self.flags, describe_compiler(target)])
-        key = hashlib.sha256(parts.encode()).hexdigest()
+        key = key_of(files, self.flags, describe_compiler(target))
         return ctypes.CDLL(str(cached(COMPILED, key, make) / name))
 
 

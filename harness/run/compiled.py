@@ -6,13 +6,16 @@ beside others.
 """
 
 import contextlib
+import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 
+import servobench
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics
 from servobench.controllers.servo import Servo, ServoController, ServoState, Stepped
 from servobench.fmus.compiler import CODE, describe_compiler, this_platform
@@ -26,10 +29,12 @@ from servobench.fmus.controllers.export import (
 )
 from servobench.fmus.controllers.record import Recorded, record
 from servobench.fmus.variables import INPUT
-from servobench.harness.config.registry import find_controller
+from servobench.harness.config.registry import find_controller, is_foreign_controller
 from servobench.harness.run.experiment import Experiment
 from servobench.harness.run.resolution import ResolvedRun
+from servobench.plant.contract.cache import COMPILED, cached, key_of
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.faults import ControllerDiverged, FilterDiverged
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Observation, trusted_observation
@@ -38,6 +43,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 # Wide vectors, where the processor has them. No operation is fused or reordered, so that the bits are the same.
 WIDE = "avx2"
 FLAGS = ("-fvisibility=default",)
+RECORDED = "recorded.json"  # file of a recorded step in the cache
 NOT_FINITE = ControllerDiverged, "the estimate or the command is not finite"
 CAUSES = {NOT_DEFINITE: (FilterDiverged, "a covariance is not positive definite")}
 """Kinds of faults and words for the codes of faults, other than those of `NOT_FINITE`."""
@@ -193,11 +199,11 @@ def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
     request = run.request
     plant = experiment.plant
     kind = (request.controller, run.controller, request.robot, request.sensing, run.run, plant.spec)
-    key = (repr(kind), *_classes(controller))  # A notebook may define a class anew.
+    with np.printoptions(floatmode="unique"):
+        words = repr(kind)
+    key = (words, *_classes(controller))  # A notebook may define a class anew.
     if key not in _FOUND:
-        _FOUND[key] = (
-            "frames are stamped" if plant.stamps else _compile(request.controller, controller)
-        )
+        _FOUND[key] = "frames are stamped" if plant.stamps else _compile(run, experiment, words)
     found = _FOUND[key]
     if isinstance(found, str):
         remark(f"controller {request.controller!r} goes on in numpy: {found}")
@@ -205,10 +211,10 @@ def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
     return ServoController(CompiledServo(cast(ServoController, controller).servo, found))
 
 
-def _compile(name: str, controller: Controller) -> Recorded | str:
+def _compile(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded | str:
     """Return the compiled step of a controller, or why there is none."""
     try:
-        recorded, _ = record_step(find_controller(name), controller)
+        recorded = _recorded(run, experiment, kind)
         fast = replace(recorded, flags=(*FLAGS, *_processor_flags()))
         fast.prepare()
     except NoForm as error:
@@ -216,6 +222,35 @@ def _compile(name: str, controller: Controller) -> Recorded | str:
     except ValueError as error:
         return str(error)
     return fast
+
+
+def _recorded(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded:
+    """Return the recorded step of a controller of some kind.
+
+    It is kept in the user's cache, as recording takes a second; but not where it depends on files of a user's.
+
+    Raises:
+        ValueError: as `record_step`.
+    """
+    name = run.request.controller
+    recorded = partial(record_step, find_controller(name), experiment.controller)
+    # The words for robots and sensing that are files have a suffix.
+    if "." in run.request.robot + run.request.sensing or is_foreign_controller(name):
+        return recorded()[0]
+
+    def make(folder: Path) -> None:
+        (folder / RECORDED).write_text(json.dumps(asdict(recorded()[0])), encoding="utf-8")
+
+    folder = cached(COMPILED, key_of(kind, _package_digest()), make)
+    text = (folder / RECORDED).read_text(encoding="utf-8")
+    return Recorded(**json.loads(text))
+
+
+@cache
+def _package_digest() -> str:
+    """Return one SHA-256 of the code and the data of this package."""
+    files = Path(servobench.__path__[0]).glob("*/**/*.*[!c]")  # no compiled code
+    return key_of(*map(digest, sorted(files)))
 
 
 def _processor_flags() -> tuple[str, ...]:

@@ -13,6 +13,8 @@ written, a temporary folder of the user's own takes its place.
 import contextlib
 import errno
 import fcntl
+import hashlib
+import json
 import os
 import re
 import stat
@@ -82,6 +84,11 @@ def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
             f"no cache folder can be written; {root} takes its place: let XDG_CACHE_HOME name one that stays"
         )
     return entry / FILES
+
+
+def key_of(*parts: object) -> str:
+    """Return a key for the JSON values that an entry depends on."""
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
 def _folders(kind: str) -> list[Path]:

@@ -17,6 +17,7 @@ from servobench.harness.run.episode import carry_out, carry_out_together
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
+from servobench.plant.contract import cache
 
 EXAMPLE = Path(__file__).parents[2] / "docs/examples/nominal-rate/nominal_rate.py"
 SEEDS = (40011, 40012, 40013, 40014)
@@ -81,8 +82,9 @@ def test_pixels_and_lost_features_are_those_of_numpy():
 
 
 @pytest.mark.slow
-def test_a_command_that_is_not_finite_ends_only_its_run(monkeypatch):
+def test_a_command_that_is_not_finite_ends_only_its_run(monkeypatch, tmp_path):
     monkeypatch.setattr(compiled, "_FOUND", {})
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # for a step that is not this package's
     command = MfacLaw.command
 
     def fragile(self, state, estimate, observation, reference):
@@ -117,6 +119,37 @@ def test_what_has_no_form_in_c_goes_on_in_numpy_and_says_so(controller, settings
     experiment = build(run)
     assert compiled.chosen(run, experiment) is experiment.controller
     assert said[0].startswith(f"controller {controller!r} goes on in numpy: {why}")
+
+
+def test_a_step_is_recorded_once_for_all_processes(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    recorded = []
+
+    def record_step(*given):
+        recorded.append(given)
+        return original(*given)
+
+    original = compiled.record_step
+    monkeypatch.setattr(compiled, "record_step", record_step)
+    short = {"random": {"duration": 0.1}}
+    slower = {**short, "kinematic": {"max_joint_speed": 1.0 - 1e-12}}
+
+    def steps_recorded(settings, name="constant"):
+        """Return how many steps a new process records."""
+        monkeypatch.setattr(compiled, "_FOUND", {})
+        recorded.clear()
+        run, *_ = runs(name, in_c=True, settings=settings)
+        assert carry_out(run).row["status"] == "completed"
+        assert [type(each) for each in compiled._FOUND.values()] == [Recorded]
+        return len(recorded)
+
+    assert [steps_recorded(short), steps_recorded(short), steps_recorded(slower)] == [1, 0, 1]
+    for path in tmp_path.rglob(compiled.RECORDED):
+        path.write_text("{}")  # which its checksum does not fit
+    cache._verified.clear()
+    assert steps_recorded(short) == 1
+    monkeypatch.setattr(compiled, "_package_digest", lambda: "other code")
+    assert [steps_recorded(short), steps_recorded(short)] == [1, 0]
 
 
 def test_without_a_compiler_numpy_goes_on(monkeypatch):
