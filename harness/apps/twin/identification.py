@@ -89,7 +89,7 @@ SWING_PERIODS = np.geomspace(1.0, 20.0, 120)  # [s] tried in the search
 MIN_WAVE = 25.0  # [1]
 MIN_SWINGS = 3  # A log must be longer than this many periods of a swing.
 RIPPLE_ORDER = MechanicsConfig().ripple_order
-ACCELERATION_SPAN = 0.2  # [s] span of the rows from which an acceleration is taken
+SMOOTHED_SPAN = 0.2  # [s] span of the rows from which a derivative is taken
 MIN_CUBIC_ROWS = 5
 MIN_PLAY = 0.002  # [rad] play about which its effect is linearised
 # The log tells a parameter if its deviation grows less than this with a prior of twice the width.
@@ -408,6 +408,7 @@ class _Problem:
         time: when they arrived, (k,) [s].
         y: their features, (k, m).
         motion: joint positions over time, a spline.
+        smooth: the same without their noise, by whose velocities latencies are told.
         names: the parameters θ.
         scale: s, their prior deviations, (p,).
         of_camera: which of them are the pose of the camera, (p,).
@@ -425,6 +426,7 @@ class _Problem:
         self.time = log.frame_time[self.rows]
         self.y = log.features[self.rows]
         self.motion = CubicSpline(log.time, log.joints)
+        self.smooth = CubicSpline(log.time, self._by_cubics(log.joints, 0))
         self.middle = float(log.time.mean())
         pixels = sees_pixels(model)
         self.names = _parameters(model, pixels=pixels)
@@ -464,7 +466,9 @@ class _Problem:
         """Return θ by name."""
         return dict(zip(self.names, (self.scale * z).tolist(), strict=True))
 
-    def _exposed(self, values: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+    def _exposed(
+        self, values: Mapping[str, Any], motion: CubicSpline
+    ) -> tuple[FloatArray, FloatArray]:
         """Return when the frames were exposed, (..., k) s, and the joints behind their gears then, (..., k, n) rad."""
         drift = values["drift"] * (self.time - self.middle)
         steady = self.time - values["latency"] - drift
@@ -478,7 +482,7 @@ class _Problem:
                 time = steady - swing_sin * np.sin(phase) - swing_cos * np.cos(phase)
         ripple = np.expand_dims(values["ripple"], -1)
         backlash = np.expand_dims(values["backlash"], -1)
-        geared = transmitted(self.motion(time), ripple, RIPPLE_ORDER)
+        geared = transmitted(motion(time), ripple, RIPPLE_ORDER)
         return time, geared + backlash * self.play(time)
 
     def _seen(self, values: Mapping[str, float], time: FloatArray, image: FloatArray) -> FloatArray:
@@ -492,7 +496,7 @@ class _Problem:
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
         values = self.values(z)
-        time, q = self._exposed(values)
+        time, q = self._exposed(values, self.motion)
         model = deviated(self.model, values)
         ball = model.arm.ball_position(q)
         image = _image(model, ball)
@@ -518,8 +522,9 @@ class _Problem:
         # Parameters of the exposure change the joints that a frame shows.
         sizes = STEP * np.diag([prior(name) for name in EXPOSURE])[..., None]
         later = {name: values[name] + size for name, size in zip(EXPOSURE, sizes, strict=True)}
-        time, joints = self._exposed(values | later)
-        shown = at.image + np.matvec(by_joint, joints - at.joints)
+        _, joints = self._exposed(values, self.smooth)
+        time, joints_then = self._exposed(values | later, self.smooth)
+        shown = at.image + np.matvec(by_joint, joints_then - joints)
         by_exposure = (self._seen(values, time, shown) - h) / STEP
         rates |= dict(zip(EXPOSURE, by_exposure, strict=True))
 
@@ -580,18 +585,20 @@ class _Problem:
         gears = transmitted(self.log.joints, values["ripple"], RIPPLE_ORDER)
         self.play = CubicSpline(self.log.time, played(gears, play) / play)
         rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
-        self.pull = CubicSpline(self.log.time, self._acceleration(rigid.feature(self.log.joints)))
+        path = rigid.feature(self.log.joints)
+        self.pull = CubicSpline(self.log.time, self._by_cubics(path, 2))
         return np.asarray(z * ~self.of_camera)
 
-    def _acceleration(self, path: FloatArray) -> FloatArray:
-        """Return the second derivative of a path at the rows, (k, m), by cubics through what is near each row.
+    def _by_cubics(self, path: FloatArray, derivative: int) -> FloatArray:
+        """Return a derivative of a path at the rows, (k, m), by cubics through what is near each row.
 
-        That of a spline through all rows consists of the noise of the joints, such as jitter of their stamps; the frame
-        has the same noise, so that a tool of negative compliance would explain it.
+        Those of a spline through all rows hold the noise of the joints, such as jitter of their stamps. The frame has
+        the same noise, so that a tool of negative compliance would explain it; and a velocity with noise seems to tell
+        a latency from all else that is like it, such as play, though no change of the latency lessens that noise.
         """
         period = self.log.spec.period
-        rows = max(2 * round(0.5 * ACCELERATION_SPAN / period) + 1, MIN_CUBIC_ROWS)
-        return np.asarray(savgol_filter(path, rows, 3, deriv=2, delta=period, axis=0))
+        rows = max(2 * round(0.5 * SMOOTHED_SPAN / period) + 1, MIN_CUBIC_ROWS)
+        return np.asarray(savgol_filter(path, rows, 3, deriv=derivative, delta=period, axis=0))
 
     def swung(self, z: FloatArray) -> FloatArray:
         """Take the period with which the latency swings most likely, and return the z with the sizes there.
