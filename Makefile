@@ -53,7 +53,6 @@ nightly: $(VENV)/ready
 	$(NIGHT).file_faults
 	$(NIGHT).file_faults --steps --runs 12
 	$(NIGHT).file_faults --caches
-	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 	$(NIGHT).hostile_sweep --runs 10000
 	$(NIGHT).signed_folders --folders 10000

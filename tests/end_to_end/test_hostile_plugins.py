@@ -77,7 +77,7 @@ COMMANDS = {
         "random.duration=1",
     ),
     "sweep": ("--seeds", "4", "--set", "random.duration=1"),
-    "tune": ("--robots", "1", "--studies", "1", "--trials", "1", "--search", "0"),
+    "tune": ("--robots", "1", "--studies", "1", "--trials", "1"),
 }
 
 

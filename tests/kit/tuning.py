@@ -1,6 +1,7 @@
 """Tuning in small: few runs, and runs whose cost is a formula."""
 
 import tomllib
+from dataclasses import fields
 
 import numpy as np
 
@@ -19,9 +20,9 @@ from servobench.harness.config.settings import flatten
 SMALL = TuningSet(robots=2)
 
 
-def plan_of(*names, trials=1, studies=1, search=0, **further):
+def plan_of(*names, trials=1, studies=1, **further):
     """Return a plan on the smallest set of runs."""
-    return TuningPlan(names, trials, SMALL, studies, search, **further)
+    return TuningPlan(names, trials, SMALL, studies, **further)
 
 
 def carried_out(folder, plan, workers=1):
@@ -62,6 +63,9 @@ def cost_by_formula(monkeypatch):
 def read_tuned(path):
     """Return the contents of a file of tuned values."""
     data = tomllib.loads(path.read_text(encoding="utf-8"))
-    studies = tuple(StudyRecord(**record) for record in data["studies"])
+    names = [field.name for field in fields(StudyRecord)]  # files of before 0.4.0 have further ones
+    studies = tuple(
+        StudyRecord(**{name: record[name] for name in names}) for record in data["studies"]
+    )
     lists = {key: tuple(data[key]) for key in ("plants", "edges", "seeds") if key in data}
     return TunedValues(**{**data, **lists, "studies": studies})

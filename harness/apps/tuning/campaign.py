@@ -1,12 +1,9 @@
-"""All studies of all methods, advanced in step; the best of each method, chosen on other robots; and its check.
+"""All studies of all methods, advanced in step; and the best of each method, chosen on other robots.
 
 In each round every study asks for the one point that it needs next; all runs of the points that no ledger knows yet are
 carried out by the workers, and the ledgers of their methods take the costs. Every decision is made in this process from
 the ledgers alone: so the outcome is the same for any number of workers, and for a call that was interrupted and
 repeated.
-
-The check of tuned values: on the second set of robots no change of one value may improve the score by much. The changes
-are those of the coordinate search: each other value of each switch, and 20 % more and less of each number.
 """
 
 from __future__ import annotations
@@ -15,7 +12,6 @@ import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, final
@@ -40,11 +36,9 @@ from servobench.harness.apps.tuning.spaces import (
     find_space,
     find_tunable,
     first_points,
-    neighbours,
     nested_settings,
     study,
     tuned_point,
-    values_of,
 )
 from servobench.harness.batch.isolation import Workers
 from servobench.harness.batch.lock import LOCK
@@ -57,7 +51,6 @@ from servobench.plant.contract.files import accessing, write_text
 from servobench.plant.contract.settings import Count, Periods, settings
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
-TOLERANCE = 0.03  # [1] share of the score by which no change may improve it
 
 
 @settings
@@ -72,8 +65,6 @@ class TuningPlan:
     """on which a point is scored"""
     studies: Count = 3
     """of each method, with samplers of their own"""
-    search: Periods = 100
-    """most points of the coordinate search that ends a study"""
     study_seed: Periods = 0
     """seed of the first study's sampler; the others count on from it"""
 
@@ -127,14 +118,13 @@ class Method:
         first = first_points(name)
         self.studies = []
         for seed in range(plan.study_seed, plan.study_seed + plan.studies):
-            course = study(name, space, first, plan.trials, plan.search, seed)
+            course = study(name, space, first, plan.trials, seed)
             self.studies.append(RunningStudy(course))
 
     @property
     def done(self) -> int:
-        """Number of requested points, as if every finished study had used its whole budget."""
-        whole = self._plan.trials + self._plan.search
-        return sum(each.asked if each.outcome is None else whole for each in self.studies)
+        """Number of points that its studies were given the scores of."""
+        return sum(each.asked for each in self.studies)
 
     def wanted(self) -> list[Wanted]:
         """Return the points that its studies ask for, after they went on as far as the ledger knows."""
@@ -197,7 +187,7 @@ class Method:
             version=version("servobench"),
             commit=read_checkout()[0] or "unknown",
             seeds=seeds,
-            budget=f"{plan.studies} × {plan.trials} trials, {plan.search} by search, on robots {' and '.join(seeds)}",
+            budget=f"{plan.studies} × {plan.trials} trials on robots {' and '.join(seeds)}",
             sha256="".join(own.code for own in offered([self.name])),
             score=score(own),
             score_of_defaults=score(of_defaults),
@@ -304,8 +294,7 @@ class TunedValues:
     # A line for each number at an edge of its box, which is wider in the next study
     edges: tuple[str, ...] = ()
     seeds: tuple[str, ...] = ()  # robots of the trials and of the second set
-    # Studies × trials, the most points of the search in each study, and the seeds
-    budget: str = ""
+    budget: str = ""  # studies × trials, and the seeds
     commit: str = "unknown"  # servobench's
     sha256: str = ""  # a user's code; empty for a controller of this package
 
@@ -353,81 +342,3 @@ def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> st
     if tables and not lines:  # TOML needs no heading of a table that only holds tables
         return tables
     return heading + lines + tables
-
-
-@dataclass(frozen=True)
-class Change:
-    """A change of one value of a method's settings in use, and its effect on the score."""
-
-    controller: str
-    key: str
-    before: Any
-    after: Any
-    score_before: float
-    score_after: float
-
-    @property
-    def gain(self) -> float:
-        """Share of the score that the change gains; negative if it loses."""
-        return 1.0 - self.score_after / self.score_before
-
-
-class Check:
-    """The settings in use of some methods with all their changes, on one set of runs."""
-
-    def __init__(self, folder: Path, controllers: Sequence[str], runs: TuningSet) -> None:
-        """Open the ledgers, in which a check goes on where it stopped.
-
-        Args:
-            folder: of the ledgers.
-            controllers: names of methods with a search space.
-            runs: the runs on which changes are judged.
-
-        Raises:
-            ConfigurationError: a name or a file that cannot be used.
-        """
-        self._runs = runs
-        self._changes: list[tuple[Ledger, list[dict[str, Any]], partial[Change]]] = []
-        points = {}
-        for name in controllers:
-            config = default_config(find_tunable(name))
-            Trial(name, config).build(runs.runs())
-            ledger = open_ledger(folder, name, runs, SECOND)
-            values = values_of(name, config)
-            before = nested_settings(values)
-            for key, other in neighbours(find_space(name), values):
-                after = nested_settings(other)
-                if before != after:
-                    change = partial(Change, name, key, values[key], other[key])
-                    self._changes.append((ledger, [before, after], change))
-                    points[f"{name}{before}"] = (ledger, name, before)
-                    points[f"{name}{after}"] = (ledger, name, after)
-        self._points = list(points.values())
-
-    def __len__(self) -> int:
-        """Return the number of points to score, those known already included."""
-        return len(self._points)
-
-    def known(self) -> int:
-        """Return how many of the points the ledgers know."""
-        return sum(ledger.costs(point) is not None for ledger, _, point in self._points)
-
-    def carry_out(self, workers: Workers) -> Iterator[str]:
-        """Score the points that the ledgers lack, and yield the controller of each point."""
-        yield from fill(self._points, self._runs, workers)
-
-    def changes(self) -> list[Change]:
-        """Return every change whose scores are known."""
-        known = []
-        for ledger, (before, after), change in self._changes:
-            costs_before = ledger.costs(before)
-            costs_after = ledger.costs(after)
-            if costs_before and costs_after:
-                known.append(change(score(costs_before), score(costs_after)))
-        return known
-
-
-def improvements(changes: Sequence[Change]) -> list[Change]:
-    """Return the changes that gain more than the tolerance, the largest first."""
-    found = [change for change in changes if change.gain > TOLERANCE]
-    return sorted(found, key=lambda change: -change.gain)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, option, switch
-from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, say
+from servobench.harness.cli.options import CONTROLLER, option
+from servobench.harness.cli.terminal import console, end_interrupted, print_rows, say
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from servobench.harness.apps.tuning.campaign import Method, TunedValues, TuningPlan
-    from servobench.harness.apps.tuning.objective import TuningSet
     from servobench.harness.batch.isolation import Workers
 
 
@@ -32,10 +30,6 @@ def tune(
         ),
     ] = 3,
     trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
-    search: Annotated[
-        int,
-        option("COUNT", "Upper limit on the points of the coordinate search that ends a study."),
-    ] = 100,
     robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 12,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
@@ -44,13 +38,6 @@ def tune(
         option("INTEGER", "First seed, counted from the beginning of the range kept for tuning."),
     ] = 0,
     study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
-    check: Annotated[
-        bool,
-        switch(
-            "--check",
-            "Change each tuned value in use one by one instead, and name changes that are better.",
-        ),
-    ] = False,
     out: Annotated[
         Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")
     ] = (Path("results") / "tuning"),
@@ -73,18 +60,14 @@ def tune(
     names = selection.split_names("controllers", controllers, tuple(SPACES), choose_tunable)
     with configuration_errors():
         runs = TuningSet(selection.split("plants", plants), robots, offset)
-        second = runs.second()
-        plan = TuningPlan(names, trials, runs, studies, search, study_seed)
+        plan = TuningPlan(names, trials, runs, studies, study_seed)
     check_study_folder(out)
     opening = open_workers(
         place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names
     )
     with opening as opened, locked(out):
-        if check:
-            _check(out, names, second, opened)
-            return
         say(
-            f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less"
+            f"at most {_counted(plan)}; --controllers, --studies, --trials and --robots make it less"
         )
         methods = open_methods(out, plan)
         interrupt = _advance(methods, plan, opened)
@@ -108,45 +91,14 @@ def tune(
 def _counted(plan: TuningPlan) -> str:
     """Return how many points and runs a campaign has, without those of its second set of robots."""
     methods = len(plan.controllers)
-    budget = plan.trials + plan.search
     runs = len(plan.runs.runs())
-    points = methods * plan.studies * budget
+    points = methods * plan.studies * plan.trials
     compared = "1 method" if methods == 1 else f"{methods} methods"
-    return f"{compared} × {plan.studies} studies × {budget} points × {runs} runs = {points * runs} runs"
+    return f"{compared} × {plan.studies} studies × {plan.trials} trials × {runs} runs = {points * runs} runs"
 
 
 def _end_interrupted(out: Path) -> NoReturn:
     end_interrupted(f"finished points are kept in {out}", "the same call continues")
-
-
-def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
-    """Score every change of one value of the settings in use and say which of them improve a score by too much."""
-    from servobench.harness.apps.tuning.campaign import TOLERANCE, Check, improvements
-    from servobench.harness.cli.progress import Bars
-
-    checked = Check(folder, names, runs)
-    total, begun = len(checked), checked.known()
-    try:
-        with Bars(console) as bars:
-            bar = bars.begin("points", total, begun)
-            for done, _ in enumerate(checked.carry_out(workers), begun + 1):
-                bars.reach(bar, done, f"{done} of {total} points")
-    except KeyboardInterrupt:
-        _end_interrupted(folder)
-    found = improvements(checked.changes())
-    if not found:
-        say(f"no change improves a score by more than {TOLERANCE:.0%}")
-        return
-    rows = []
-    for change in found:
-        values = (
-            f"{value:.4g}" if isinstance(value, float) else str(value)
-            for value in (change.before, change.after)
-        )
-        scores = f"{change.score_before:.4f}", f"{change.score_after:.4f}", f"{change.gain:.1%}"
-        rows.append((change.controller, change.key, *values, *scores))
-    print_rows(("controller", "key", "in use", "better", "score", "with the change", "gain"), rows)
-    sys.exit(FAILED)
 
 
 def _advance(
@@ -158,7 +110,7 @@ def _advance(
     from servobench.harness.apps.tuning.campaign import advance
     from servobench.harness.cli.progress import Bars
 
-    total = plan.studies * (plan.trials + plan.search)
+    total = plan.studies * plan.trials
     try:
         with Bars(console, TextColumn("points, best {task.fields[best]}")) as bars:
             shown = {

@@ -24,9 +24,9 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 
 import math
 import warnings
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import optuna
@@ -178,11 +178,19 @@ def _declared_box(name: str, kind: type, key: str, default: Any, given: Tuned) -
     return FloatDistribution(low, high, log=given.log)
 
 
-def _switches(space: Space) -> Space:
+def _switches(space: Space) -> dict[str, CategoricalDistribution]:
     """Return the parameters of a space that are a choice, not a number."""
     return {
         key: choice for key, choice in space.items() if isinstance(choice, CategoricalDistribution)
     }
+
+
+def _flips(space: Space, values: Point) -> Iterator[Point]:
+    """Yield every point that differs from `values` by another choice of one switch."""
+    for key, switch in _switches(space).items():
+        for other in switch.choices:
+            if other != values[key]:
+                yield {**values, key: other}
 
 
 def edges(space: Space, values: Point) -> dict[str, str]:
@@ -241,20 +249,6 @@ def nested_settings(values: Point) -> dict[str, Any]:
     return nest(rounded)
 
 
-STEP = 0.2  # [1] share of a number by which it is changed
-STEP_FROM_ZERO = 0.05  # [1] share of the range's upper end by which a number of 0 is changed
-ACCEPTED = 0.005  # [1] share of the score that a change must gain to be kept
-
-
-class Found(NamedTuple):
-    """Where a coordinate search ended."""
-
-    values: Point
-    score: float
-    evaluations: int  # requested points
-    complete: bool  # whether no change improves the score; False: the budget ended first
-
-
 @dataclass(frozen=True)
 class StudyRecord:
     """The result of a study, as files of tuned values hold it."""
@@ -262,16 +256,13 @@ class StudyRecord:
     seed: int  # seed of the sampler
     trials: int  # trials of the sampler, the first points included
     best_trial: int  # the number of the best one; 0 is that of the defaults
-    best_trial_score: float
-    search_points: int  # scored by the coordinate search that began there
-    search_complete: bool  # whether no change of one value helps; False: its budget ended first
-    score: float  # score at its end
+    score: float  # that trial's
     second_score: float  # score on the second set; NaN until the settings are scored there
     settings: Mapping[str, Any]  # nested values
 
 
 def study(
-    name: str, space: Space, first: Sequence[Point], trials: int, search: int, seed: int
+    name: str, space: Space, first: Sequence[Point], trials: int, seed: int
 ) -> Generator[Point, float, StudyRecord]:
     """Search for the best point of a space.
 
@@ -280,7 +271,6 @@ def study(
         space: where.
         first: points that are tried before the sampler is asked, the defaults first.
         trials: number of trials, the first points included; at least 1.
-        search: most points that the coordinate search may ask for; 0 for none.
         seed: of the sampler.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -300,73 +290,14 @@ def study(
         points.append(trial.params)
         sampled.tell(trial, score)
     best = scores.index(min(scores))
-    found = yield from coordinate_search(space, points[best], scores[best], search)
     return StudyRecord(
         seed=seed,
         trials=trials,
         best_trial=best,
-        best_trial_score=scores[best],
-        search_points=found.evaluations,
-        search_complete=found.complete,
-        score=found.score,
+        score=scores[best],
         second_score=math.nan,
-        settings=nested_settings(found.values),
+        settings=nested_settings(points[best]),
     )
-
-
-def coordinate_search(
-    space: Space, values: Point, score: float, budget: int
-) -> Generator[Point, float, Found]:
-    """Improve a point: a generator that yields the points whose scores it needs, and returns the last one kept.
-
-    Args:
-        space: the values that may be changed, in the order in which it is tried.
-        values: where to begin.
-        score: of that point.
-        budget: most points to ask for.
-    """
-    keys, at, idle, asked = list(space), 0, 0, 0
-    seen = {str(nested_settings(values))}
-    while idle < len(keys):
-        key = keys[at % len(keys)]
-        improved = False
-        for other in changes(space[key], values[key]):
-            candidate = {**values, key: other}
-            if str(nested_settings(candidate)) in seen:
-                continue
-            if asked == budget:
-                return Found(values, score, asked, complete=False)
-            came = yield candidate
-            asked += 1
-            seen.add(str(nested_settings(candidate)))
-            if came < (1.0 - ACCEPTED) * score:
-                values, score, improved = candidate, came, True
-                break
-        idle = 0 if improved else idle + 1
-        at += not improved
-    return Found(values, score, asked, complete=True)
-
-
-def changes(distribution: Distribution, value: Any) -> list[Any]:  # noqa: ANN401 - a number or a choice
-    """Return the values that the search and the check try instead of `value`."""
-    if isinstance(distribution, CategoricalDistribution):
-        return [choice for choice in distribution.choices if choice != value]
-    reached = [_step(distribution, value, sign) for sign in (1, -1)]
-    return [other for other in dict.fromkeys(reached) if other != value]
-
-
-def _step(distribution: FloatDistribution | IntDistribution, value: float, sign: int) -> float:
-    size = STEP * abs(value) or STEP_FROM_ZERO * distribution.high
-    if distribution.step is not None:
-        size = distribution.step * max(1, round(size / distribution.step))
-    return _within(distribution, value + sign * size, value)
-
-
-def neighbours(space: Space, values: Point) -> list[tuple[str, Point]]:
-    """Return every point that differs from `values` by one change, with the key that is changed."""
-    return [
-        (key, {**values, key: other}) for key in space for other in changes(space[key], values[key])
-    ]
 
 
 def first_points(name: str) -> list[Point]:
@@ -380,8 +311,7 @@ def first_points(name: str) -> list[Point]:
     space = find_space(name)
     default = default_values(entry)
     own = tuned_point(entry)
-    flips = [point for _, point in neighbours(_switches(space), default)]
-    points = [default, own, *flips]
+    points = [default, own, *_flips(space, default)]
     common = [key for key in space if name in SPACES or key.startswith("aids.")]
     for other in SPACES:
         tuned = flatten(tuned_settings(other))

@@ -48,7 +48,7 @@ class Mine(servobench.Controller):
         J = self.jacobian(observation.joint_position)
         return servobench.Command(np.clip(self.gain * J.T @ np.linalg.solve(J @ J.T + 4e-4 * np.eye(3), e), -1, 1))
 """
-SMALL = ("--robots", "1", "--studies", "1", "--search", "0", "--workers", "1")
+SMALL = ("--robots", "1", "--studies", "1", "--workers", "1")
 VALUES = """\
 budget = "1 × 2 trials"
 seeds = ["10000:10008", "15000:15008"]
@@ -97,7 +97,7 @@ def test_tuned_values_are_found_beside_the_code_and_taken_by_every_command(
     words = ("compare", "--controllers", "./mine.py,constant,mfac+rls", *compared, "--out", "c")
     told = output_of(*words)
     assert "Mine †" in told
-    budget = "1 × 4 trials, 0 by search, on robots 10000:10008 and 15000:15008"
+    budget = "1 × 4 trials on robots 10000:10008 and 15000:15008"
     assert f"\n† Mine was tuned: {budget}\n" in told
     assert "\nNot tuned, unlike the others: mfac+rls\n" in told
     manifest = json.loads((tmp_path / "c" / "manifest.json").read_text())

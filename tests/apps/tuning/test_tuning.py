@@ -13,7 +13,6 @@ from kit.nightly import some
 from kit.tuning import SMALL, cost_by_formula, read_tuned
 from servobench import controllers
 from servobench.controllers.aids import EQUIPPED
-from servobench.harness.apps.tuning.campaign import TOLERANCE, Change, Check, improvements
 from servobench.harness.apps.tuning.objective import (
     KINDS,
     LEVELS,
@@ -332,29 +331,3 @@ def test_committed_values_of_all_methods_have_the_same_budget_on_the_same_runs()
     tuned = [read_tuned(path) for path in TUNED.values()]
     assert len({tuning_set(each) for each in tuned}) == 1
     assert len({tuple((study.seed, study.trials) for study in each.studies) for each in tuned}) == 1
-
-
-def test_the_check_of_every_change_finds_the_one_that_helps(made_up, tmp_path):
-    check = Check(tmp_path, ("rls", "broyden"), SMALL)
-    assert (len(check) > 20, check.known()) == (True, 0)
-    assert len(list(check.carry_out(Workers()))) == len(check) == check.known()
-    judged = check.changes()
-    assert {(each.controller, each.key) for each in judged} == {
-        (name, key) for name in ("rls", "broyden") for key in find_space(name)
-    }
-    found = improvements(judged)
-    assert found == sorted(found, key=lambda change: -change.gain)
-    assert all(
-        (change in found) == (change.score_after < (1.0 - TOLERANCE) * change.score_before)
-        for change in judged
-    )
-    scored = len(made_up)
-    again = Check(tmp_path, ("rls", "broyden"), SMALL)
-    assert list(again.carry_out(Workers())) == []
-    assert (again.changes(), len(made_up)) == (judged, scored)
-
-
-def test_a_change_that_gains_little_is_no_improvement():
-    little, much = (Change("rls", "law.damping", 1.0, 1.2, 1.0, after) for after in (0.975, 0.965))
-    assert improvements([little, much]) == [much]
-    assert much.gain == pytest.approx(0.035)

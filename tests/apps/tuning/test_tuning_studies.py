@@ -1,11 +1,9 @@
-"""The coordinate search, studies that go on where they stopped, and the files they leave."""
+"""Studies that go on where they stopped, and the files they leave."""
 
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, read_tuned
 from servobench import controllers
@@ -26,14 +24,10 @@ from servobench.harness.apps.tuning.objective import (
     score,
 )
 from servobench.harness.apps.tuning.spaces import (
-    ACCEPTED,
     StudyRecord,
-    changes,
-    coordinate_search,
     default_values,
     find_tunable,
     first_points,
-    neighbours,
     nested_settings,
     tuned_point,
 )
@@ -50,100 +44,25 @@ def made_up(monkeypatch):
     return cost_by_formula(monkeypatch)
 
 
-def driven(search, cost):
-    """Carry a search or study out on a function of its points; return its result and what it asked for."""
-    asked = []
-    try:
-        wanted = next(search)
-        while True:
-            asked.append(wanted)
-            wanted = search.send(cost(wanted))
-    except StopIteration as end:
-        return end.value, asked
-
-
-SPACE = {
-    "on": CategoricalDistribution((False, True)),
-    "gain": FloatDistribution(0.1, 10.0, log=True),
-    "count": IntDistribution(1, 9),
-}
-START = {"on": False, "gain": 1.0, "count": 3}
-
-
-def bowl(point):
-    return (
-        1.0
-        + (np.log(point["gain"] / 3.0)) ** 2
-        + 0.1 * (point["count"] - 7) ** 2
-        + (not point["on"])
-    )
-
-
-def test_the_coordinate_search_ends_where_no_change_of_one_value_improves_the_score():
-    found, asked = driven(coordinate_search(SPACE, START, bowl(START), 1000), bowl)
-    assert found.complete
-    assert found.evaluations == len(asked) == len({str(point) for point in asked})
-    assert found.score == bowl(found.values)
-    assert found.values["on"]
-    assert all(
-        bowl(point) >= (1.0 - ACCEPTED) * found.score
-        for _, point in neighbours(SPACE, found.values)
-    )
-
-
-def test_the_coordinate_search_keeps_to_its_budget_and_keeps_the_best_so_far():
-    found, asked = driven(coordinate_search(SPACE, START, bowl(START), 4), bowl)
-    assert (len(asked), found.evaluations, found.complete) == (4, 4, False)
-    assert found.score == min(map(bowl, asked)) < bowl(START)
-    nothing, asked = driven(coordinate_search(SPACE, START, bowl(START), 0), bowl)
-    assert (nothing.values, asked, nothing.complete) == (START, [], False)
-
-
-@pytest.mark.parametrize(
-    ("distribution", "value", "tried"),
-    [
-        (CategoricalDistribution(("a", "b", "c")), "b", ["a", "c"]),
-        (FloatDistribution(0.5, 8.0, log=True), 2.0, [2.4, 1.6]),
-        (FloatDistribution(0.5, 8.0, log=True), 8.0, [6.4]),
-        (FloatDistribution(0.0, 3.0), 0.0, [0.15]),
-        (FloatDistribution(2.0, 5.0, step=1.0), 2.0, [3.0]),
-        (FloatDistribution(0.0, 0.15, step=0.05), 0.05, [0.1, 0.0]),
-        (IntDistribution(1, 20), 10, [12, 8]),
-        (IntDistribution(3, 10), 3, [4]),
-    ],
-)
-def test_switches_take_their_other_values_and_numbers_a_step_of_a_fifth_within_range(
-    distribution, value, tried
-):
-    assert changes(distribution, value) == (
-        tried if isinstance(value, str) else pytest.approx(tried)
-    )
-
-
 def test_the_defaults_come_first_and_no_two_trials_are_alike(made_up, tmp_path):
     trials = len(first_points("broyden")) + 6
     (method,) = carried_out(tmp_path, plan_of("broyden", trials=trials))
     assert made_up[0][2] == str(find_tunable("broyden").config())
     assert len(method.ledger.path.read_text().splitlines()) == 1 + trials
-    assert method.studies[0].outcome.search_points == 0
 
 
-def test_the_sampler_finds_better_values_than_known_and_the_search_still_better_ones(
-    made_up, tmp_path
-):
+def test_the_sampler_finds_better_values_than_the_known_ones(made_up, tmp_path):
     known = len(first_points("broyden"))
     few = outcomes(tmp_path / "few", plan_of("broyden", trials=known))[0][0]
-    more = outcomes(tmp_path / "more", plan_of("broyden", trials=known + 10, search=120))[0][0]
+    more = outcomes(tmp_path / "more", plan_of("broyden", trials=known + 10))[0][0]
     assert more.best_trial >= known
-    assert more.score < more.best_trial_score < few.best_trial_score
+    assert more.score < few.score
 
 
 def test_a_campaign_taken_up_again_is_that_which_was_never_interrupted(made_up, tmp_path):
-    whole = outcomes(
-        tmp_path / "whole", plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6)
-    )
+    whole = outcomes(tmp_path / "whole", plan_of("ukf_mfac", "broyden", trials=12, studies=2))
     once = len(made_up)
-    part = plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6)
+    part = plan_of("ukf_mfac", "broyden", trials=12, studies=2)
     (tmp_path / "parts").mkdir()
     halfway = advance(open_methods(tmp_path / "parts", part), part, Workers())
     for _ in range(25):  # leaves in the middle of a round, as a kill does
@@ -195,9 +114,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     brief |= {task: {"radius": 0.1, "lap_time": 1.0} for task in ("circle", "lemniscate")}
     monkeypatch.setattr(objective, "TASKS", brief)
     monkeypatch.setattr(objective, "SECOND_FACTOR", 1)
-    plan = replace(
-        plan_of("broyden:published", trials=2, studies=2, search=1), runs=TuningSet(robots=1)
-    )
+    plan = replace(plan_of("broyden:published", trials=2, studies=2), runs=TuningSet(robots=1))
     one, two = carried_out(tmp_path / "one", plan), carried_out(tmp_path / "two", plan, workers=2)
     written, again = write_results(tmp_path / "one", one), write_results(tmp_path / "two", two)
     assert written == again
@@ -205,10 +122,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     assert read_tuned(tmp_path / "one" / "broyden.published.toml") == tuned
     assert TuningSet(tuned.plants, tuned.robots, tuned.offset) == plan.runs
     assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (8, 8)
-    assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [
-        (0, 2, 1),
-        (1, 2, 1),
-    ]
+    assert [(each.seed, each.trials) for each in tuned.studies] == [(0, 2), (1, 2)]
     on_second = [tuned.second_score_of_defaults, *(each.second_score for each in tuned.studies)]
     assert tuned.second_score <= min(on_second), "the values in use stay unless a study is better"
     assert tuned.settings == nested_settings(tuned_point(find_tunable("broyden:published")))
@@ -309,7 +223,7 @@ def test_a_ledger_that_cannot_be_written_says_so(tmp_path):
 @pytest.mark.parametrize("studies", [0, 2])
 def test_words_with_quotes_and_any_number_of_studies_survive_the_file(tmp_path, studies):
     settings = {"law": {"kind": 'x"y', "inner": {"on": True}}}
-    record = StudyRecord(0, 2, 1, 0.5, 3, True, 0.25, 0.3, settings)
+    record = StudyRecord(0, 2, 1, 0.25, 0.3, settings)
     whole = read_tuned(TUNED)
     odd = replace(whole, version='1.0+"a"\\b', settings=settings, studies=(record,) * studies)
     write_tuned(tmp_path / "odd.toml", odd)
