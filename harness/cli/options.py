@@ -165,7 +165,6 @@ NO_CAMERA = {
 }
 NO_SENSING = {
     "play": "its page shows the ball in space; figures of run --sensing show pixels",
-    "record": "films show the ball's way through space; figures of run --sensing show pixels",
     "controllers": "settings of a controller are the same under all sensing",
 }
 RobotOption = Annotated[str, named_option("--robot", ROBOT, ROBOT_WORDS, NO_WORLD)]

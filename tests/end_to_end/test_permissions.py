@@ -66,8 +66,6 @@ CASES = {  # call -> (what may not be used, its mode, words of the line)
     "report results --out locked/page.html": (
         "locked", LOCKED, "report locked/page.html cannot be written: Permission denied"),
     "record results --out locked/films": ("locked", LOCKED, "locked/films cannot be written: Permission denied"),
-    "record --plant kinematic --out locked/films": (
-        "locked", LOCKED, "locked/films cannot be written: Permission denied"),
     "tune --trials 2 --controllers ukf_mfac --out locked/new": (
         "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
     "shadow steps.csv --controller constant --out locked/seen.csv": (

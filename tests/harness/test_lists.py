@@ -91,7 +91,7 @@ def completed(*words):
         (("compare", "--tasks", "al"), ["all"]),
         (("sweep", "--plants", "kinematic,b"), ["kinematic,bullet"]),
         (("plants", "k"), ["kinematic"]),
-        (("record", "--controller", "calib"), ["calibrating_mfac", "calibrated"]),
+        (("run", "--controller", "calib"), ["calibrating_mfac", "calibrated"]),
         (("init", "--tasks", "exp2,ci"), ["exp2,circle"]),
     ],
 )

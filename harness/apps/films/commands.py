@@ -4,71 +4,24 @@ from __future__ import annotations
 
 import errno
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import (
-    CONTROLLER,
-    MISMATCH,
-    PLANT,
-    ROBOT,
-    TASK,
-    Value,
-    named_option,
-    option,
-)
+from servobench.harness.cli.options import option
 from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import writing_together
 
-if TYPE_CHECKING:
-    from servobench.harness.apps.films.replay import LoggedRun
-
-RECORDED = {
-    "controller": "rbfnn_mfac",
-    "task": "circle",
-    "mismatch": "moderate",
-    "robot": "ur5",
-    "seed": 0,
-}
 RECORDINGS = "recordings"
 
 
-def _new(name: str, value: Value | str) -> Any:  # noqa: ANN401 - typer's own word for it
-    return option(value, f"New run: {name}, default {RECORDED[name]}.")
-
-
-@dataclass(frozen=True)
-class NewRun:
-    """The run that is carried out where no folder is given."""
-
-    plant: Annotated[
-        str | None, option(PLANT, "New run: plant, default bullet, or mujoco without PyBullet.")
-    ] = None
-    controller: Annotated[str | None, _new("controller", CONTROLLER)] = None
-    task: Annotated[str | None, _new("task", TASK)] = None
-    mismatch: Annotated[str | None, _new("mismatch", MISMATCH)] = None
-    robot: Annotated[str | None, _new("robot", ROBOT)] = None
-    seed: Annotated[int | None, _new("seed", "INTEGER")] = None
-    set_: Annotated[
-        list[str] | None,
-        named_option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05."),
-    ] = None
-    config: Annotated[Path | None, option("FILE", "New run: TOML file with settings.")] = None
-
-
 def record(
-    folder: Annotated[
-        Path | None,
-        typer.Argument(help="Results folder whose run to show; without one a run is carried out."),
-    ] = None,
+    folder: Annotated[Path, typer.Argument(help="Results folder whose run to show.")],
     *,
     run: options.RunIdOption = None,
-    new: NewRun,
     kinds: Annotated[
         str, option("NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")
     ] = "all",
@@ -89,14 +42,16 @@ def record(
 ) -> None:
     """Make a film (MP4, GIF) and snapshots of a run.
 
-    They show the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
+    They show the rendered arm, its camera's view and the error.
     """
     from servobench.harness.apps.films.film import GIF, KINDS, MP4, write_recording
-    from servobench.harness.apps.films.replay import stretch
+    from servobench.harness.apps.films.replay import logged_run, stretch
+    from servobench.harness.batch.logs import find_run
+    from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import engine_of, rendered_plant
 
-    into = out or (folder or Path("results")) / RECORDINGS
+    into = out or folder / RECORDINGS
     ending = into.suffix.removeprefix(".")
     film = out if ending in (MP4, GIF) else None
     if film is not None:
@@ -112,8 +67,10 @@ def record(
         )
     wanted = selection.split_names("kinds", kinds, KINDS)
     _check_writable(into)
-    with telling(console, "reading" if folder else "running") as tell:
-        shown = _shown(folder, run, new)
+    with telling(console, "reading") as tell:
+        opened = ResultsFolder(folder)
+        row = find_run(opened, run)
+        shown = logged_run(row, opened.steps([row["run_id"]]))
         say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
         name = str(shown.track.row["run_id"])
         if film is not None:
@@ -125,45 +82,9 @@ def record(
 
 
 def _check_writable(folder: Path) -> None:
-    """Refuse a folder that takes no film before a run is carried out and drawn."""
+    """Refuse a folder that takes no film before a run is drawn."""
     standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     if not standing.is_dir():
         raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
     if not os.access(standing, os.W_OK | os.X_OK):
         raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
-
-
-def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
-    """Return the run of a folder that is named, or its only one, or carry out a new one."""
-    from servobench.harness.apps.films.replay import logged_run
-    from servobench.harness.batch.logs import find_run
-    from servobench.harness.batch.results import ResultsFolder
-    from servobench.harness.config.registry import rendered_plant
-    from servobench.harness.config.settings import read_settings
-    from servobench.harness.run.episode import run_experiment
-    from servobench.harness.run.request import RunRequest
-    from servobench.harness.run.resolution import check_settings
-    from servobench.plant.robot.mismatch import Mismatch
-
-    given = {name: value for name, value in vars(new).items() if value not in (None, [])}
-    if folder is not None:
-        if given:
-            name = next(iter(given)).rstrip("_")
-            raise ConfigurationError(
-                f"--{name} belongs to a new run; a run of {folder} is named by --run"
-            )
-        opened = ResultsFolder(folder)
-        row = find_run(opened, run_id)
-        return logged_run(row, opened.steps([row["run_id"]]))
-    if run_id is not None:
-        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
-    names = {
-        name: given.get(name, usual)
-        for name, usual in {"plant": rendered_plant(new.plant), **RECORDED}.items()
-    }
-    settings = read_settings(new.config, new.set_ or [])
-    chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
-    request = RunRequest(**names | chosen | {"mismatch": Mismatch.parse(names["mismatch"])})
-    check_settings(settings, [request.plant, request.controller, request.task])
-    result = run_experiment(request, settings)
-    return logged_run(result.row, result.steps)

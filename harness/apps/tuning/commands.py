@@ -60,6 +60,7 @@ def tune(
     names = selection.split_names("controllers", controllers, tuple(SPACES), choose_tunable)
     with configuration_errors():
         runs = TuningSet(selection.split("plants", plants), robots, offset)
+        runs.second()  # there must be room for these robots, too
         plan = TuningPlan(names, trials, runs, studies, study_seed)
     check_study_folder(out)
     opening = open_workers(

@@ -227,28 +227,6 @@ def test_without_ffmpeg_there_is_one_line(refusal_of, monkeypatch, tmp_path, fol
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_new_run_is_recorded_below_the_results_without_ffmpeg(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    arguments = [
-        "--plant",
-        "kinematic",
-        "--controller",
-        "constant",
-        "--task",
-        "exp2",
-        "--kinds",
-        "snapshots",
-    ]
-    assert servobench(monkeypatch, "record", *arguments, "--set", "exp2.duration=0.5") == 0
-    name = "kinematic-constant-exp2-moderate-0_snapshots"
-    assert {path.name for path in (tmp_path / "results" / "recordings").iterdir()} == {
-        f"{name}.png",
-        f"{name}.pdf",
-    }
-    assert f"{name}.png" in capsys.readouterr().out
-
-
 def test_a_file_named_as_a_film_is_that_film(refusal_of, monkeypatch, tmp_path, folder):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
     target = tmp_path / "mine.gif"
