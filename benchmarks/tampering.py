@@ -3,7 +3,7 @@
     python benchmarks/tampering.py [WAY ...]
 
 Each way starts from an honest submission of two robots in the world `severe` and changes it or its controller; then
-the clauses are checked, with one run of it and one of a ceiling again. Ways that no check of one submission can see are
+the clauses are checked, with its runs and one of a ceiling again. Ways that no check of one submission can see are
 in `UNSEEN`, with what would see them. The honest submission must keep all clauses.
 """
 
@@ -34,7 +34,7 @@ from servobench.plant.contract.checksums import SUMS, digest
 from servobench.plant.contract.faults import ConfigurationError
 
 ROBOTS = 2
-RERUNS = 1
+RERUNS = ROBOTS
 WORLD = "severe"
 HOW = Execution(workers=1, bounds=Bounds(run_timeout=120.0))
 HONEST = """

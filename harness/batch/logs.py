@@ -1,7 +1,7 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,7 @@ def logged_in_folder(
             that cannot be made ready here.
     """
     row = find_run(folder, run_id)
-    run = run_in_folder(folder, row, controller, (sensing,))
+    run = run_in_folder(folder, row, controller, {"sensing": sensing})
     steps = folder.steps([row["run_id"]])
     if steps.empty:
         raise ConfigurationError(
@@ -96,7 +96,7 @@ def logged_in_folder(
 
 
 def run_in_folder(
-    folder: ResultsFolder, row: Row, controller: str | None, named: Collection[str] = ()
+    folder: ResultsFolder, row: Row, controller: str | None, named: Mapping[str, str] | None = None
 ) -> ResolvedRun:
     """Return a run of a results folder.
 
@@ -104,17 +104,18 @@ def run_in_folder(
         folder: of results.
         row: of the run in the table of runs.
         controller: as above.
-        named: controllers and set-ups that the user names, which may be code.
+        named: names that the user gives, by `controller` or `sensing`, which may be those of code.
 
     Raises:
         ConfigurationError: its row names code that the user did not name, or it cannot be made ready here.
     """
     manifest = folder.manifest
+    known = named or {}
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
         name = str(row.get(word, ""))
         # Code of users may have any name.
         place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")
-        if name not in named and (place or CODE.search(name)):
+        if name != known.get(word) and (place or CODE.search(name)):
             remedy = (
                 "nothing that a folder names is run"
                 if word == "plant"

@@ -134,7 +134,7 @@ def _be_controller(tell: Tell, link: int, folder: ResultsFolder, row: Row, code:
     name = choose_controller(f"{row['controller']}={code.place}")
     if find_controller(name).needs_truth:
         raise ConfigurationError(f"{name} asks for the true robot, as ceilings do")
-    run = run_in_folder(folder, row, None, (name,))
+    run = run_in_folder(folder, row, None, {"controller": name})
     request = replace(run.request, seed=run.request.seed + DECOY)
     decoy = build(replace(run, request=request))
     _, controller = held_to_contract(decoy.plant, decoy.controller)
