@@ -47,7 +47,6 @@ Shapes: TypeAlias = Mapping[str, tuple[tuple[int, ...], str]]
 PACKAGE = "servobench."
 OWN = "servobench.fmus."
 HEADERS = ("controller.h", "linear_algebra.h")
-SOURCES = ("controller.c", "side_by_side.c")
 # Numbers do not depend on the level of optimisation, and the functions are called from Python.
 CHECKED = ("-O1", "-fvisibility=default")
 # The loop over systems side by side
@@ -218,16 +217,16 @@ class Recorded:
         target = this_platform()
         name = f"controller{target.suffix}"
         loop = SIDE_BY_SIDE.format(self.states, self.inputs, self.outputs)
-        files = dict(zip(SOURCES, (self.source, loop), strict=True))
-        files |= {header: committed("controller", header) for header in HEADERS}
+        sources = {"controller.c": self.source, "side_by_side.c": loop}
+        headers = {header: committed("controller", header) for header in HEADERS}
 
         def make(folder: Path) -> None:
-            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as sources:
-                for file, text in files.items():
-                    Path(sources, file).write_text(text, encoding="utf-8")
-                compile_library(Path(sources), SOURCES, target, folder / name, self.flags)
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+                for file, text in (sources | headers).items():
+                    Path(scratch, file).write_text(text, encoding="utf-8")
+                compile_library(Path(scratch), list(sources), target, folder / name, self.flags)
 
-        key = key_of(files, self.flags, describe_compiler(target))
+        key = key_of(sources, headers, self.flags, describe_compiler(target))
         return ctypes.CDLL(str(cached(COMPILED, key, make) / name))
 
 

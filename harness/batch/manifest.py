@@ -23,7 +23,6 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import Section, flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
-from servobench.harness.run.compiled import describe_compilation
 from servobench.harness.run.own_metrics import OwnMetric
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
@@ -89,6 +88,8 @@ def describe_batch(
         if plant.engine:
             engines[name] = plant.engine()
     if any(run.varies(COMPILED) for run in runs.examples) or sections["run"].compiled:
+        from servobench.harness.run.compiled import describe_compilation  # noqa: PLC0415 - as for runs
+
         engines["controllers in C"] = describe_compilation()
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),

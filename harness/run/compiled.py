@@ -189,13 +189,11 @@ _FOUND: dict[tuple[Any, ...], Recorded | str] = {}
 
 
 def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
-    """Return the controller of a run, or of runs of its kind side by side.
+    """Return the controller of a run, or of runs of its kind side by side, in C.
 
-    It is in C where the run asks for it; where that cannot be, a remark says why numpy goes on.
+    Where that cannot be, a remark says why numpy goes on.
     """
     controller = experiment.controller
-    if not run.run.compiled:
-        return controller
     request = run.request
     plant = experiment.plant
     kind = (request.controller, run.controller, request.robot, request.sensing, run.run, plant.spec)
@@ -214,8 +212,7 @@ def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
 def _compile(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded | str:
     """Return the compiled step of a controller, or why there is none."""
     try:
-        recorded = _recorded(run, experiment, kind)
-        fast = replace(recorded, flags=(*FLAGS, *_processor_flags()))
+        fast = replace(_recorded(run, experiment, kind), flags=(*FLAGS, *_processor_flags()))
         fast.prepare()
     except NoForm as error:
         return f"it cannot be compiled{error}"
@@ -241,9 +238,8 @@ def _recorded(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded:
     def make(folder: Path) -> None:
         (folder / RECORDED).write_text(json.dumps(asdict(recorded()[0])), encoding="utf-8")
 
-    folder = cached(COMPILED, key_of(kind, _package_digest()), make)
-    text = (folder / RECORDED).read_text(encoding="utf-8")
-    return Recorded(**json.loads(text))
+    path = cached(COMPILED, key_of(kind, _package_digest()), make) / RECORDED
+    return Recorded(**json.loads(path.read_bytes()))
 
 
 @cache

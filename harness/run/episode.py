@@ -10,11 +10,11 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
 from servobench.harness.config.registry import engine_of
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import same_folder
-from servobench.harness.run.compiled import chosen
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import Experiment, build, build_together, naming_the_lack
 from servobench.harness.run.knowledge import keep_networks
@@ -68,7 +68,7 @@ def carry_out(
     ending = Ending()
     with same_folder(), contextlib.closing(experiment.plant) as plant, careful():
         try:
-            pair = held_to_contract(plant, chosen(resolved, experiment))
+            pair = held_to_contract(plant, chosen_controller(resolved, experiment))
             with naming_the_lack(plant, own_robot=experiment.drawn.true is None):
                 run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
         except BaseException as error:
@@ -90,6 +90,15 @@ def carry_out(
     if not steps:
         return RunResult(row, None, image, ending.trace)
     return RunResult(row, table, image, ending.trace)
+
+
+def chosen_controller(run: ResolvedRun, experiment: Experiment) -> Controller:
+    """Return the controller of a run, or of runs side by side; it is in C where the run asks for it."""
+    if not run.run.compiled:
+        return experiment.controller
+    from servobench.harness.run.compiled import chosen  # noqa: PLC0415 - numpy does without
+
+    return chosen(run, experiment)
 
 
 def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None) -> list[RunResult]:
@@ -114,7 +123,7 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
     bench, log = cast(Bench, many.plant), ManyLogs(many.plant.spec, many.periods, ends)
     try:
         with same_folder(), careful(), contextlib.suppress(AllEnded):
-            controller = cast(ServoController, chosen(runs[0], many))
+            controller = cast(ServoController, chosen_controller(runs[0], many))
             servo = ManyServos(controller.servo, ends)
             seeds = [each.request.seed for each in runs]
             run_loop(ManyBenches(bench, ends), servo, many.desired(), many.loop, seeds, log)

@@ -5,7 +5,7 @@ import contextlib
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.compiled import chosen
+from servobench.harness.run.episode import chosen_controller
 from servobench.harness.run.experiment import build
 from servobench.harness.run.feasibility import check_features, check_possible
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -26,7 +26,7 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     """
     try:
         experiment = build(run, progress=progress)
-        chosen(run, experiment)
+        chosen_controller(run, experiment)
         drawn = experiment.drawn
         spec = experiment.plant.spec
         with contextlib.closing(experiment.plant) as plant:

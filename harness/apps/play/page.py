@@ -83,7 +83,8 @@ class Page:
         lines = [uplot.Series(label=name, stroke=styles[name].colour) for name in names]
         with self._server.atomic():
             self._plot.series = (uplot.Series(label="s"), *lines)
-            self._plot.data = (np.zeros(1),) * (1 + len(names))
+            # Without any number above 0 a logarithmic axis raises an error in the browser.
+            self._plot.data = tuple(np.array(session.errors).T)
 
     def run(self) -> None:
         """Let the runs go on while somebody looks, in real time or as fast as wanted, until Ctrl-C."""

@@ -136,6 +136,10 @@ def test_a_choice_on_the_page_begins_anew_and_a_refused_one_changes_nothing():
         choose(page, beside="calibrating_mfac", mismatch="severe", seed=7, task="circle")
         choose(page, **{"plant.sensing.latency": 0.1, "plant.sensing.outliers": 0.05})
         session = page.session
+        # A plot of logarithms without a number above 0 ends with an error in the browser.
+        _, *errors_shown = page._plot.data
+        assert np.greater(errors_shown, 0.0).all()
+        assert len(errors_shown) == 2
         assert [side.name for side in session.sides] == ["ukf_mfac", "calibrating_mfac"]
         assert str(session.request.mismatch) == "severe"
         assert (session.request.task, session.request.seed) == ("circle", 7)
