@@ -13,8 +13,6 @@ from servobench.harness.cli.terminal import console, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.resolution import ResolvedRun
 
@@ -39,9 +37,6 @@ def analyse(
             "--identify",
             "Identify all loops from logged small motions, while estimators go on learning.",
         ),
-    ] = False,
-    simulate: Annotated[
-        bool, switch("--simulate", "Also find the limits of gain and latency by simulation.")
     ] = False,
     overrides: options.Overrides,
     out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results")
@@ -71,10 +66,6 @@ def analyse(
     if not loops:
         raise ConfigurationError("no loop is left to analyse")
     table = loop_table(loops)
-    if simulate:
-        chosen = {run.request.controller: run for run in runs}
-        with console.status("simulating"):
-            table = table.join(_simulated([chosen[loop.name] for loop in loops]))
     text = printed(table)
     with accessing(out), writing_together(out) as partial:
         write_csv(table, partial / TABLE)
@@ -104,21 +95,3 @@ def _resolved(
     return [
         resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names
     ]
-
-
-def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
-    """Return the simulated limits, a row for each run; NaN for a controller that is not composed."""
-    import pandas as pd
-
-    from servobench.controllers.servo import ServoController
-    from servobench.harness.apps.loops.equilibrium import SmallLoop, warm_up
-
-    rows = []
-    for warm in map(warm_up, runs):
-        row = {"simulated_gain_margin": float("nan"), "simulated_latency_limit_s": float("nan")}
-        if isinstance(warm.controller, ServoController):
-            loop = SmallLoop(warm)
-            row["simulated_gain_margin"] = loop.gain_limit()
-            row["simulated_latency_limit_s"] = loop.latency_limit()
-        rows.append(row)
-    return pd.DataFrame(rows)

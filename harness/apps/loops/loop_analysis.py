@@ -70,13 +70,6 @@ MARGIN_COLUMNS = {
     "disk\nmargin": ("disk_margin", 1.0, 2),
     "over-\nshoot, %": ("overshoot", 100.0, 0),
 }
-# The same where limits were simulated, too
-SIMULATED_COLUMNS = {
-    "gain\nmargin": ("gain_margin", 1.0, 2),
-    "gain,\nsimulated": ("simulated_gain_margin", 1.0, 2),
-    "latency\nlimit, ms": ("latency_limit_s", 1000.0, 0),
-    "latency,\nsimulated": ("simulated_latency_limit_s", 1000.0, 0),
-}
 LEGEND = (
     "Gain margin: factor on the command. Delay margin: further latency of the camera. M_s: largest singular value of "
     "the sensitivity at the feature. Disk margin: for changes of each feature by itself. A dash: the loop is unstable. "
@@ -390,8 +383,7 @@ def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
 
 def printed(table: pd.DataFrame) -> pd.DataFrame:
     """Return the table as text for a terminal."""
-    columns = SIMULATED_COLUMNS if "simulated_gain_margin" in table else MARGIN_COLUMNS
     text: dict[str, Any] = {"controller": table["controller"]}
-    for heading, (name, factor, digits) in columns.items():
+    for heading, (name, factor, digits) in MARGIN_COLUMNS.items():
         text[heading] = [number(factor * value, f".{digits}f") for value in table[name]]
     return pd.DataFrame(text)

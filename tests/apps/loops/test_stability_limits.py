@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from kit import small_loop
 from kit.nightly import some
-from servobench.harness.apps.loops import equilibrium
-from servobench.harness.apps.loops.equilibrium import SmallLoop, warm_up
+from kit.small_loop import SmallLoop
+from servobench.harness.apps.loops.equilibrium import warm_up
 from servobench.harness.apps.loops.loop_analysis import analyse_loop
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
@@ -27,7 +28,7 @@ def analysed(controller, settings):
 
 
 def test_simulated_limits_are_the_predicted_ones(monkeypatch):
-    monkeypatch.setattr(equilibrium, "GAIN_PRECISION", 0.5 * NEAR)
+    monkeypatch.setattr(small_loop, "GAIN_PRECISION", 0.5 * NEAR)
     predicted, loop, period = analysed("pid+true", {})
     assert loop.gain_limit() == pytest.approx(predicted.margins.gain_margin, rel=NEAR)
     # The search goes on from the latency of the loop period by period, and a search from none is long
