@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 
-import servobench
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics
 from servobench.controllers.servo import Servo, ServoController, ServoState, Stepped
 from servobench.fmus.compiler import CODE, describe_compiler, this_platform
@@ -30,6 +29,7 @@ from servobench.fmus.controllers.export import (
 from servobench.fmus.controllers.record import Recorded, record
 from servobench.fmus.variables import INPUT
 from servobench.harness.config.registry import find_controller, is_foreign_controller
+from servobench.harness.config.source import PACKAGE_FOLDER
 from servobench.harness.run.experiment import Experiment
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.contract.cache import COMPILED, cached, key_of
@@ -245,7 +245,7 @@ def _recorded(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded:
 @cache
 def _package_digest() -> str:
     """Return one SHA-256 of the code and the data of this package."""
-    files = Path(servobench.__path__[0]).glob("*/**/*.*[!c]")  # no compiled code
+    files = PACKAGE_FOLDER.glob("*/**/*.*[!c]")  # no compiled code
     return key_of(*map(digest, sorted(files)))
 
 
