@@ -97,7 +97,7 @@ def test_the_figures_of_a_comparison_have_a_unit_at_every_axis_and_every_control
     figures = list(folder_figures(ResultsFolder(comparison(tmp_path / "out"))))
     assert [named.kind for named in figures] == [
         "errors", "features", "paths", "tracking", "tracking_path", "jacobian", "settling", "effort", "smoothness",
-        "step_times", "joint_speeds", "joint_speeds", "joint_speeds",
+        "joint_speeds", "joint_speeds", "joint_speeds",
     ]  # fmt: skip
     for named in figures:
         figure = named.figure

@@ -16,7 +16,6 @@ from servobench.harness.apps.figures.measures import (
     FIGURES,
     draw_conditions,
     draw_measures,
-    draw_step_times,
 )
 from servobench.harness.apps.figures.paths import draw_paths
 from servobench.harness.apps.figures.responses import (
@@ -226,7 +225,6 @@ def _plans(group: Group, ensembles: Tasks, styles: Styles, size: int) -> Iterato
             chosen = runs[runs["task"].isin(part)]
             for kind in FIGURES:
                 yield _Plan(kind, text, part, partial(draw_measures, chosen, kind, styles))
-    yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
         yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until[task]))
 

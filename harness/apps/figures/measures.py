@@ -1,4 +1,4 @@
-"""Figures of metrics: of each run, of computing times, and of settled runs over a condition that varies."""
+"""Figures of metrics: of each run, and of settled runs over a condition that varies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pandas.api.types import is_numeric_dtype
 
 from servobench.harness.analysis import comparison
@@ -33,7 +32,6 @@ from servobench.harness.apps.figures.style import (
     plain_logarithms,
     write_inside,
 )
-from servobench.harness.apps.figures.tracks import Tasks
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
@@ -42,7 +40,6 @@ from servobench.plant.contract.checks import FloatArray
 SETTLING = "settling_time_s"
 NEVER = 1.3  # [1] place of a run that never settled, over the largest settling time
 FIGURES = ("settling", "effort", "smoothness", "own")  # each shows the metrics that name it
-PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE = 0.165  # [in] a controller
 WIDE_RANGE = 30.0  # largest over smallest value from which on an axis is logarithmic
 MAX_RANGE = 1e6  # largest over smallest value that an axis shows
@@ -134,90 +131,6 @@ def _short_name(name: str, layout: Layout) -> str:
     if len(name) <= letters:
         return name
     return f"…{name[1 - letters :]}"
-
-
-def draw_step_times(tasks: Tasks, styles: Styles, layout: Layout = WIDE) -> Figure | None:
-    """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values.
-
-    Steps that take longer than the control period are marked and, on a wide sheet, counted.
-    """
-    known = _step_times(tasks)
-    if not known:
-        return None
-    periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
-    limit = 1e3 * max([period for period in periods if math.isfinite(period)], default=math.nan)
-    # Bold letters are slightly wider in a fine picture; the strip at the right is for them.
-    inside = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.98, 1.0))
-    figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout=inside)
-    axes = figure.add_subplot()
-    top = 1.4 * max(float(np.max(values)) for values in known.values())
-    for i, (name, values) in enumerate(known.items()):
-        words = _draw_times(axes, i, values, limit, styles[name])
-        too_slow = "\n" in words
-        if layout.wide:
-            axes.annotate(
-                words,
-                (1.01, i),
-                xycoords=("axes fraction", "data"),
-                va="center",
-                fontsize=TEXT - 0.5,
-                fontweight="bold" if too_slow else None,
-                linespacing=1.0,
-            )
-    above = {**MARKS_OF["above"], "fontsize": TEXT - 0.5}
-    if layout.wide:
-        axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", **above)
-    if math.isfinite(limit):
-        top = max(top, 1.6 * limit)
-        axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
-        axes.axvspan(
-            limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0
-        )
-        words = f"control period, {limit:g} ms"
-        axes.annotate(words, (limit, 1.0), xycoords=("data", "axes fraction"), ha="right", **above)
-    plain_logarithms(axes, "x")
-    axes.set_xlabel("step of the controller [ms]" if layout.wide else "step [ms]")
-    axes.set_xlim(right=top)
-    _name_rows(axes, list(known), layout)
-    return figure
-
-
-def _step_times(tasks: Tasks) -> dict[str, FloatArray]:
-    """Return the times of all steps of each controller [ms] that has some."""
-    parts: dict[str, list[FloatArray]] = {}
-    for ensembles in tasks.values():
-        for name, ensemble in ensembles.items():
-            parts.setdefault(name, []).append(ensemble.step_time)
-    times = {name: 1e-3 * np.concatenate(own) for name, own in parts.items()}
-    return {name: values for name, values in times.items() if len(values)}
-
-
-def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> str:
-    """Draw the times of a controller's steps [ms] in line `i`, and return the numbers that belong beside it."""
-    low, first, middle, third, high = np.percentile(values, PERCENTILES)
-    axes.plot([low, high], [i, i], color=style.colour, **MARKS_OF["range"])
-    axes.plot([first, third], [i, i], color=style.colour, **MARKS_OF["middle_half"])
-    axes.plot(
-        middle,
-        i,
-        color=style.colour,
-        marker=style.marker or "o",
-        markerfacecolor=style.face,
-        **MARKS_OF["middle"],
-    )
-    largest = values.max()
-    words = ", ".join(_time_in_words(time) for time in (middle, high, largest))
-    if largest > limit:
-        axes.plot(largest, i, **MARKS_OF["too_slow"])
-        words += f"\n{np.count_nonzero(values > limit)} of {len(values)} too slow"
-    return words
-
-
-def _time_in_words(time: float) -> str:
-    """Return a time [ms] with its unit; a time that rounds to less than 1 ms in µs."""
-    if time < 0.9995:
-        return f"{1e3 * time:.0f} µs"
-    return f"{time:.3g} ms"
 
 
 def _label(column: str, runs: pd.DataFrame) -> str:

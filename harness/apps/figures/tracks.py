@@ -32,11 +32,10 @@ OVERVIEW = 600  # [rows] About this many stand for a long run.
 CLOSING = 400
 ERROR = "error_norm"
 JACOBIAN = "jacobian_error"
-STEP_TIME = "controller_time_us"
 # A row of an overview has the root mean square of these columns over all rows for which it stands.
 ROOT_MEAN_SQUARES = (ERROR, JACOBIAN)
 ERROR_COLUMNS = ("run_id", "time_s", ERROR)
-COLUMNS = (*ERROR_COLUMNS, JACOBIAN, STEP_TIME)
+COLUMNS = (*ERROR_COLUMNS, JACOBIAN)
 BAND = (0.1, 0.5, 0.9)  # quantiles over seeds: the band's edges and its middle
 WINDOW = 0.5  # [s] The error along a curve is averaged over this time.
 MARGIN = 1.5  # [1] A figure shows moves for this multiple of the slowest settling time.
@@ -230,7 +229,6 @@ class Ensemble(Shown):
     # Norm of the true error, (r, k) [`error_unit`]; infinite from an early end on.
     error: FloatArray
     jacobian_error: FloatArray  # relative error, (r, k) [%]; NaN where it is not known
-    step_time: FloatArray  # durations of all steps of the controller, (s,) [µs]
     settling_time: float  # median [s]; infinite if half of the runs never settled
     mostly_ended: bool  # whether half of the runs ended early, so that no median goes on to the end
     camera_moved_at: float  # when the camera was moved [s]; NaN where it was not
@@ -314,7 +312,6 @@ def _ensemble(tracks: Sequence[Track], never: int, moves_at: object) -> Ensemble
         errors.append(padded(track.error(), after_end))
     errors += never * [np.full(len(time), math.inf)]
     jacobian_errors = [padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]
-    step_times = np.concatenate([track.column(STEP_TIME) for track in tracks])
     settled_after = [*settling_times(runs).fillna(math.inf), *never * [math.inf]]
     ended_early = (runs["status"] != COMPLETED).sum() + never
     return Ensemble(
@@ -322,7 +319,6 @@ def _ensemble(tracks: Sequence[Track], never: int, moves_at: object) -> Ensemble
         time=time,
         error=np.stack(errors),
         jacobian_error=np.stack(jacobian_errors),
-        step_time=step_times[step_times > 0.0],
         settling_time=float(np.median(settled_after)),
         mostly_ended=bool(ended_early / (len(runs) + never) >= BAND[1]),
         camera_moved_at=_camera_moved_at(runs, longest_track, moves_at),

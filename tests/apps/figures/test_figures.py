@@ -13,7 +13,7 @@ from kit.command import no_file_above
 from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import Estimate
-from servobench.harness.apps.figures.measures import draw_measures, draw_step_times, same_curves
+from servobench.harness.apps.figures.measures import draw_measures, same_curves
 from servobench.harness.apps.figures.paths import draw_paths
 from servobench.harness.apps.figures.responses import draw_joint_motion, draw_moves, draw_tracking
 from servobench.harness.apps.figures.style import (
@@ -224,19 +224,6 @@ def test_speed_acceleration_and_jerk_of_joints_stand_side_by_side_in_a_row_a_met
     assert jerk.texts[0].get_text() == "RMS 1.13e+03"
     assert [axes.get_ylabel() for axes in figure.axes[::3]] == ["ukf_mfac", "rls"]
     assert speed.get_xlim()[1] == 2.0
-
-
-def test_steps_longer_than_the_period_are_marked_and_counted(tmp_path):
-    rows = [made_up_row(name, controller=name) for name in ("ukf_mfac", "rls")]
-    slow = made_up_steps("rls")
-    slow.loc[[3, 7], "controller_time_us"] = 60_000.0
-    ensembles = load(tmp_path / "out", rows, [made_up_steps("ukf_mfac"), slow])
-    (axes,) = draw_step_times(ensembles, STYLES).axes
-    texts = [text.get_text() for text in axes.texts]
-    assert [text for text in texts if "too slow" in text] == [
-        "132 µs, 60 ms, 60 ms\n2 of 60 too slow"
-    ]
-    assert "control period, 50 ms" in texts
 
 
 def test_moves_that_never_settled_stand_at_the_edge_and_are_counted():
