@@ -77,22 +77,17 @@ def joined(
     period = min(_period(moved.time), _period(frames.captured))
     table = _rows(moved, frames, period, column_names(spec))
     begin, *_, end = moved.time.tolist()
-    last = end - begin + clocks.lowest
-    table["feature_valid"] = table[CAPTURED].between(clocks.highest, last)
+    # A frame counts if joints are logged at every latency that is sought.
+    table["feature_valid"] = table[CAPTURED].between(clocks.highest, end - begin + clocks.lowest)
     if not table["feature_valid"].any():
         first = frames.captured[0]
         raise ConfigurationError(
             f"{features} and {joints} do not overlap: features run from {first:.3f} s on, joints from {begin:.3f} "
             f"to {end:.3f} s; if clocks are apart, write offset = … (in s) in [features] of the map"
         )
-    further = (("commands", joints, keys.commands), ("reference", features, keys.reference))
-    for kind, path, own in further:
-        stream = _further_stream(path, kind, own, spec)
-        if stream is not None:
-            middles = table[TIME] + 0.5 * period
-            newest = np.searchsorted(stream.time - begin, middles) - 1
-            signal, *_ = USUAL[kind]
-            table[column_names(spec)[signal]] = stream.values[np.maximum(newest, 0)]
+    middles = begin + table[TIME] + 0.5 * period
+    _add_held(table, "commands", joints, keys.commands, spec, middles)
+    _add_held(table, "reference", features, keys.reference, spec, middles)
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
     settings = Settings({"run": {"period": period}, PLANT: {"command_delay": 0.0}})
     return resolve(request, settings), table, clocks
@@ -127,19 +122,29 @@ def _rows(
     return table
 
 
-def _further_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stream | None:
-    """Return a stream that a log may lack, None for none; one that is there but broken is named and left out.
+def _add_held(
+    table: pd.DataFrame,
+    kind: str,
+    path: Path,
+    keys: StreamMap,
+    spec: PlantSpec,
+    instants: FloatArray,
+) -> None:
+    """Add a stream that a log may lack, as it holds at instants (k,) [s]; a broken one is named and left out.
 
     One that the map describes has to be there, and whole.
     """
     try:
-        return read_stream(path, kind, keys, spec)
+        stream = read_stream(path, kind, keys, spec)
     except ConfigurationError as error:
         if keys != StreamMap():
             raise
         if not isinstance(error, StreamAbsent):
             remark(f"{error}; {kind} are left out")
-        return None
+        return
+    newest = np.searchsorted(stream.time, instants) - 1
+    signal, *_ = USUAL[kind]
+    table[column_names(spec)[signal]] = stream.values[np.maximum(newest, 0)]
 
 
 def _period(stamps: FloatArray) -> float:
