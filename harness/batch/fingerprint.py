@@ -69,5 +69,7 @@ def numbers(plants: Iterable[str], controllers: Iterable[str]) -> dict[str, Floa
 
 def fingerprint(plants: Iterable[str], controllers: Iterable[str]) -> dict[str, str]:
     """Return the SHA-256 of each of `numbers`."""
-    values = numbers(plants, controllers).items()
-    return {name: hashlib.sha256(each.data).hexdigest() for name, each in values}
+    return {
+        name: hashlib.sha256(each.data).hexdigest()
+        for name, each in numbers(plants, controllers).items()
+    }

@@ -166,7 +166,7 @@ def test_figures_of_a_run_are_pictures_and_the_same_each_time(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     paths = draw_figures(ResultsFolder(folder))
     assert {path.suffix for path in paths} == {".png"}
-    assert len(paths) == 6
+    assert len(paths) == 5
     before = {path.name: path.read_bytes() for path in paths}
     assert before == {path.name: path.read_bytes() for path in draw_figures(ResultsFolder(folder))}
 
