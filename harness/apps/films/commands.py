@@ -15,8 +15,6 @@ from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import writing_together
 
-RECORDINGS = "recordings"
-
 
 def record(
     folder: Annotated[Path, typer.Argument(help="Results folder whose run to show.")],
@@ -51,7 +49,7 @@ def record(
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import engine_of, rendered_plant
 
-    into = out or folder / RECORDINGS
+    into = out or folder / "recordings"
     ending = into.suffix.removeprefix(".")
     film = out if ending in (MP4, GIF) else None
     if film is not None:

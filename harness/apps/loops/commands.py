@@ -55,9 +55,8 @@ def analyse(
     from servobench.harness.apps.loops.loop_pictures import write_pictures
     from servobench.plant.contract.files import accessing, write_csv, writing_together
 
-    runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops = []
-    for run in runs:
+    for run in _resolved(controllers, mismatch, seed, robot, overrides.settings()):
         with console.status(f"analysing {run.request.controller}"):
             try:
                 loops.append(analyse_loop(run, jacobian, identify=identify))

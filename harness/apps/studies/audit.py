@@ -3,8 +3,6 @@
 They are those of an audit of manipulation benchmarks (arXiv 2606.04233, 2026), for challenges that are scored.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
 from typing import NamedTuple
@@ -27,6 +25,7 @@ HERE = "servobench.harness.apps.studies.probes"
 # Shortcuts, as controllers are named
 PROBES = ("constant", f"open_loop={HERE}:OpenLoop", f"held={HERE}:HeldCommand")
 TUNED_ON = 48  # robots on which the methods of the bench were tuned: 12 of trials, 36 of the choice among them
+LEGEND = "a challenge is solved by a shortcut that reaches half of the best score"
 AUDIT = "audit.csv"
 ROBOTS = "tuned_on"
 
@@ -108,10 +107,12 @@ def significance(judged: pd.DataFrame) -> Iterator[Finding]:
             found = paired_difference(both[pair[0]], both[pair[1]], 0.0)
             p_values.append(found.p_value)
             near.append(pair in neighbours)
+    if not p_values:
+        return
     sure = np.array(holm(p_values)) < ALPHA
-    chosen = np.array(near, dtype=bool)
+    chosen = np.array(near)
     for words, own in (("neighbours", sure[chosen]), ("all pairs", sure)):
-        share = f"{own.sum()} of {len(own)} ({100.0 * own.sum() / max(len(own), 1):.0f} %)"
+        share = f"{own.sum()} of {len(own)} ({100.0 * own.mean():.0f} %)"
         yield Finding("significance", words, "significant claims", share)
 
 
@@ -166,7 +167,6 @@ def audit(
         each[~each["controller"].isin(bounds) & each["score"].notna()]
         for each in (judged, tuned_on)
     )
-    robots = sorted(fresh["seed"].unique())[: tuned["seed"].nunique()]
     findings = []
     for name, own in find_shortcuts(judged, challenges).iterrows():
         word = "no shortcut"
@@ -175,6 +175,6 @@ def audit(
         numbers = f"{own['shortcut']} {own['reached']:.2f}, best method {own['best']:.2f}"
         findings.append(Finding("shortcut", str(name), word, numbers))
     findings += significance(fresh)
-    findings += overfitting(fresh[fresh["seed"].isin(robots)], tuned)
+    findings += overfitting(fresh, tuned)
     findings += dependence(fresh, challenges)
     return pd.DataFrame(findings)

@@ -126,9 +126,7 @@ def suite(
             "--audit needs all robots, and --until-decided leaves some out; give one of them"
         )
     methods = selection.split("controllers", controllers)
-    names = methods
-    if audit:
-        names = diagnostics.with_probes(methods)
+    names = diagnostics.with_probes(methods) if audit else methods
     where = selection.split("plants", plants) if plants else ()
     robots = parse_seeds(seeds)
     metrics = selection.choose_metrics(metric)
@@ -155,6 +153,5 @@ def suite(
     print_tables(suite_tables(shown), "score: reference over method, at most 1; 0 for a lost run")
     say("\n".join(describe_tuning(manifest)))
     if audit:
-        legend = f"scores from {diagnostics.SOLVED:g} of the best on solve a challenge"
-        print_tables([("audit", found)], legend)
+        print_tables([("audit", found)], diagnostics.LEGEND)
     say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")

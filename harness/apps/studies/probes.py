@@ -3,8 +3,6 @@
 With `constant`, the pseudo-inverse of the unchanged first Jacobian, these are the probes of an audit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from servobench.controllers.controller import Controller, RobotKnowledge
@@ -13,18 +11,11 @@ from servobench.plant.contract.signals import Command, Observation
 
 GAIN = 3.0  # [1/s]
 DAMPING = 0.02  # [m/rad] of the pseudo-inverse
-ITERATIONS = 20  # inverse kinematics in a period
-STEP = 0.3  # [rad] a joint moves at most in an iteration
 HELD_AFTER = 1.0  # [s]
 
 
-def damped_steps(J: FloatArray, e: FloatArray) -> FloatArray:
-    """Return Jᵀ (J Jᵀ + δ²I)⁻¹ e."""
-    return np.asarray(J.T @ np.linalg.solve(J @ J.T + DAMPING**2 * np.eye(len(e)), e))
-
-
-class OpenLoop(Controller):
-    """q* with h(q*) = y_ref for the features h of the nominal robot; u = gain (q* − q). It sees encoders, no camera."""
+class Shortcut(Controller):
+    """u = gain J⁺ e with the nominal Jacobian J and a damped pseudo-inverse."""
 
     def __init__(self, knowledge: RobotKnowledge) -> None:
         """Take the nominal model.
@@ -32,48 +23,41 @@ class OpenLoop(Controller):
         Raises:
             ValueError: there is none.
         """
-        if knowledge.nominal_model is None:
-            raise ValueError("an open loop needs the geometry of the robot")
+        if knowledge.nominal_model is None or knowledge.nominal_jacobian is None:
+            raise ValueError("a shortcut needs the geometry of the robot")
         self.model = knowledge.nominal_model
-        self.limit = knowledge.spec.joint_velocity_limit
         self.theta, self.cameras = self.model.start(())
-
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Begin at the joints of the start."""
-        self.goal = observation.joint_position
-
-    def step(self, observation: Observation, reference: FloatArray) -> Command:
-        """Return the command to where the nominal robot would have the reference."""
-        for _ in range(ITERATIONS):
-            found = self.model.derivatives(self.theta, self.cameras, self.goal[None], np.zeros(1))
-            step = damped_steps(found.by_joint[0], reference[0] - found.feature[0])
-            self.goal = self.goal + np.clip(step, -STEP, STEP)
-        u = GAIN * (self.goal - observation.joint_position)
-        return Command(np.clip(u, -self.limit, self.limit))
-
-
-class HeldCommand(Controller):
-    """u = gain J⁺ e with the nominal Jacobian for the first second; then the last command is held."""
-
-    def __init__(self, knowledge: RobotKnowledge) -> None:
-        """Take the nominal Jacobian.
-
-        Raises:
-            ValueError: there is none.
-        """
-        if knowledge.nominal_jacobian is None:
-            raise ValueError("a first command needs the nominal Jacobian")
         self.jacobian = knowledge.nominal_jacobian
         self.limit = knowledge.spec.joint_velocity_limit
 
+    def command(self, q: FloatArray, e: FloatArray) -> Command:
+        """Return the command for an error e, (m,), at joint positions q, (n,) [rad]."""
+        J = self.jacobian(q)
+        damped = J @ J.T + DAMPING**2 * np.eye(len(e))
+        u = GAIN * (J.T @ np.linalg.solve(damped, e))
+        return Command(np.clip(u, -self.limit, self.limit))
+
     def reset(self, observation: Observation, seed: int) -> None:
         """Begin at rest."""
-        self.command = Command(np.zeros_like(observation.joint_position))
+        self.last = Command(np.zeros_like(observation.joint_position))
+
+
+class OpenLoop(Shortcut):
+    """e = y_ref − h(q) with the features h of the nominal robot: it sees encoders, no camera."""
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """Return the command towards where the nominal robot would have the reference."""
+        q = observation.joint_position
+        seen = self.model.feature(self.theta, self.cameras, q[None], np.zeros(1))[0]
+        return self.command(q, reference[0] - seen)
+
+
+class HeldCommand(Shortcut):
+    """e = y_ref − y for the first second; then the last command is held."""
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """Return the command of the law, or the last one."""
         if observation.time < HELD_AFTER:
             e = reference[0] - observation.feature
-            u = GAIN * damped_steps(self.jacobian(observation.joint_position), e)
-            self.command = Command(np.clip(u, -self.limit, self.limit))
-        return self.command
+            self.last = self.command(observation.joint_position, e)
+        return self.last

@@ -48,7 +48,9 @@ NOTE = 115  # letters on a line of the notes below the title
 MOVE = "camera_move"
 LATENCY = "latency"
 NOISE = "noise"
-Measure: TypeAlias = Callable[[pd.DataFrame], comparison.Estimate]  # of the runs at a place
+Measure: TypeAlias = Callable[
+    [pd.DataFrame], comparison.Estimate
+]  # a number from the runs at a place
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def ranking(table: pd.DataFrame) -> list[Ranked]:
     apart = _told_apart(means, drawn)
     found = []
     rank = 1
-    best = str(means.index[0])  # of those with this rank
+    best = str(means.index[0])  # among those with this rank
     for place, name in enumerate(map(str, means.index), start=1):
         if frozenset((best, name)) in apart:
             rank = place

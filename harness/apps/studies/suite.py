@@ -107,17 +107,18 @@ def carry_out_suite(
             campaigns[each.name] = ending_when_decided(campaigns[each.name], question, find)
     tables = carry_out_parts(campaigns, out, how)
     declare_metrics({each.name: each.entry.record() for each in offered(metrics)})
-    parts = [judge(challenge, tables[challenge.name]) for challenge in challenges]
-    if question is not None:
-        answers = []
-        for each in challenges:
+    parts = []
+    answers: list[Answer] = []
+    for each in challenges:
+        judged = judge(each, tables[each.name])
+        if question is not None:
             answers += challenge_answers(each, tables[each.name], question)
+            judged = shared_robots(judged, each)
+        parts.append(judged)
+    if question is not None:
         budget = sum(map(len, runs.values()))
         print_answers(answers, question, sum(map(len, tables.values())), budget)
         write_csv(answer_table(answers), out / DECISIONS)
-        parts = [
-            shared_robots(judged, each) for each, judged in zip(challenges, parts, strict=True)
-        ]
     judged = mark_solved(pd.concat(parts, ignore_index=True), challenges)
     write_csv(judged, out / RUNS)
     _write_rows(methods_rows(judged), out / METHODS)

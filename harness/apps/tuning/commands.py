@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, option
@@ -81,7 +81,7 @@ def tune(
             "those of your controllers lie beside their code and are taken from now on"
         )
     if interrupt is not None:
-        _end_interrupted(out)
+        end_interrupted(f"finished points are kept in {out}", "the same call continues")
     if lost:
         raise ConfigurationError(
             f"no run of {', '.join(lost)} came near its target with any settings, so no values are written; "
@@ -96,10 +96,6 @@ def _counted(plan: TuningPlan) -> str:
     points = methods * plan.studies * plan.trials
     compared = "1 method" if methods == 1 else f"{methods} methods"
     return f"{compared} × {plan.studies} studies × {plan.trials} trials × {runs} runs = {points * runs} runs"
-
-
-def _end_interrupted(out: Path) -> NoReturn:
-    end_interrupted(f"finished points are kept in {out}", "the same call continues")
 
 
 def _advance(
