@@ -38,7 +38,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(output_of, tmp_path):
     assert manifest["packages"]["numpy"]
     assert manifest["blas"][0]["name"]
     figures = {path.stem for path in (out / "figures").glob("*.png")}
-    assert len(figures) == len(list((out / "figures").iterdir())) == 6
+    assert len(figures) == len(list((out / "figures").iterdir())) == 5
     assert not (out / "report.html").exists()
     assert json.loads(runs["mismatch_values"][0])["camera_angle"] != 0.0
 

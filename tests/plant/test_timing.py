@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kit.plants import NEEDS_BULLET, configure, setup
-from servobench.harness.apps.loops.equilibrium import TIME_DIGITS
+from kit.small_loop import TIME_DIGITS
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.bench import Bench, build_bench, common_step
 from servobench.plant.contract.sensing import SensingConfig
