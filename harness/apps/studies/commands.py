@@ -151,7 +151,7 @@ def suite(
     manifest = ResultsFolder(out / worlds[0].name).manifest
     shown = mark_tuned(judged, manifest)
     print_tables(suite_tables(shown), "score: reference over method, at most 1; 0 for a lost run")
-    say("\n".join(describe_tuning(manifest)))
+    say("\n".join(describe_tuning(manifest, command=not audit)))
     if audit:
         print_tables([("audit", found)], diagnostics.LEGEND)
     say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")
