@@ -59,7 +59,7 @@ class Mine(servobench.Controller):
 """
 BETTER = """        u = 5.0 * np.linalg.pinv(truth.jacobian) @ (reference[0] - truth.feature)
 """
-ANSWERS = Path("/tmp/servobench-answers")
+ANSWERS = Path(tempfile.gettempdir()) / "servobench-answers"
 STEP = "        return servobench.Command(u)"
 
 
@@ -123,8 +123,10 @@ CODE = {  # way -> text of the controller
     ),
     "reads the plant in frames of its callers": HONEST.replace(STEP, FRAMES + BETTER + STEP),
     "reads the plant by sys._getframe": HONEST.replace(STEP, GETFRAME + BETTER + STEP),
-    "reads a file of answers": in_step("u = u * float(open('/tmp/servobench-answers').read())"),
-    "writes a file for its next run": in_step("open('/tmp/servobench-notes', 'a').write('.')"),
+    "reads a file of answers": in_step(f"u = u * float(open({str(ANSWERS)!r}).read())"),
+    "writes a file for its next run": in_step(
+        f"open({str(ANSWERS.with_name('servobench-notes'))!r}, 'a').write('.')"
+    ),
     "acts by the clock": in_step(
         "import datetime", "u = u * (1.0 + 1e-3 * datetime.datetime.now().microsecond / 1e6)"
     ),

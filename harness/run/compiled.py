@@ -224,14 +224,14 @@ def _compile(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded | 
 def _recorded(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded:
     """Return the recorded step of a controller of some kind.
 
-    It is kept in the user's cache, as recording takes a second; but not where it depends on files of a user's.
+    It is kept in the user's cache, as recording takes a second; but not where it depends on files of a user's, whose
+    words for robots and sensing have a suffix.
 
     Raises:
         ValueError: as `record_step`.
     """
     name = run.request.controller
     recorded = partial(record_step, find_controller(name), experiment.controller)
-    # The words for robots and sensing that are files have a suffix.
     if "." in run.request.robot + run.request.sensing or is_foreign_controller(name):
         return recorded()[0]
 
@@ -245,8 +245,8 @@ def _recorded(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded:
 @cache
 def _package_digest() -> str:
     """Return one SHA-256 of the code and the data of this package."""
-    files = PACKAGE_FOLDER.glob("*/**/*.*[!c]")  # no compiled code
-    return key_of(*map(digest, sorted(files)))
+    files = sorted(PACKAGE_FOLDER.glob("*/**/*.*"))
+    return key_of(*(digest(file) for file in files if file.suffix != ".pyc"))
 
 
 def _processor_flags() -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A run whose controller is kept at arm's length, in an isolated process with the limits of foreign code.
+"""A run whose controller is in an isolated process of its own, with the limits of foreign code.
 
     this process                                       isolated process
     plant, loop, log, metrics   -- observation -->     controller, beside the plant of another robot
@@ -150,9 +150,7 @@ def _answer(controller: Controller, command: Command | None) -> dict[str, Any]:
     if command is None:
         return {}
     estimate = controller.estimated_jacobian()
-    rows = None
-    if estimate is not None:
-        rows = estimate.tolist()
+    rows = None if estimate is None else estimate.tolist()
     numbers = controller.diagnostics().items()
     return {
         "command": command.joint_velocity.tolist(),

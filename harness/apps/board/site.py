@@ -104,9 +104,7 @@ def read_entries(folders: Iterable[Path]) -> dict[str, Entry]:
     for head, folder in heads:
         author = head.author, head.method
         counts[author] += 1
-        order = ""
-        if totals[author] > 1:
-            order = f"no. {counts[author]} of {totals[author]}"
+        order = f"no. {counts[author]} of {totals[author]}" if totals[author] > 1 else ""
         key = folder.resolve().name
         if key in entries:
             raise ConfigurationError(f"two submissions are in folders called {key}; rename one")

@@ -197,9 +197,7 @@ def _compare(folder: ResultsFolder, row: Row, made: RunResult, *, same: bool) ->
     found = first_difference(_as_table(row), _as_table(made.row), LEFT_OUT, in_row)
     if found is None:
         return None
-    verdict: Verdict = "unknown"
-    if same:
-        verdict = "failed"
+    verdict: Verdict = "failed" if same else "unknown"
     return Finding("6.3", verdict, f"{name}: {found}")
 
 

@@ -127,9 +127,7 @@ def overfitting(fresh: pd.DataFrame, tuned_on: pd.DataFrame) -> Iterator[Finding
         two = mean_with_interval(other[name].to_numpy())
         gain = one.value - two.value
         reach = 0.5 * float(np.hypot(one.high - one.low, two.high - two.low))
-        word = "no higher score"
-        if gain > reach:
-            word = "higher where tuned"
+        word = "higher where tuned" if gain > reach else "no higher score"
         robots = f"{one.count} and {two.count} robots"
         yield Finding("overfitting", str(name), word, f"{gain:+.3f} ± {reach:.3f}, {robots}")
 
