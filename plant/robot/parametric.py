@@ -14,22 +14,23 @@ rotation vector δ in its own frame or moved by d in that of its mount, by
 
     ∂x/∂δ = [x]×                         ∂x/∂d = −R_cᵀ
 
-All motions are computed in the frames of the cameras: the chain of joints begins at the base as a camera sees it. For a
-camera on the hand that follows from the pose of the flange.
+With the axes X, Y, Z of a joint's own frame as a camera sees them, and the target's place (x, y, z) in that frame, a
+motion z × p is x Y − y X. So the target's place is carried along the chain from the target to the cameras, and the axes
+are carried the other way. For a camera on the hand that chain is the inverse one.
 
-Arrays have leading axes: an ensemble of robots, or runs side by side, is one model. In here the coordinates x, y and z
-are the first axis of each array and the k joint positions are the last one, so that every operation runs along many
-contiguous numbers; stacks of small matrices cost several times as much.
+Arrays have leading axes: an ensemble of robots, or runs side by side, is one model. In here each coordinate is an array
+and the k joint positions are the last axis, so that every operation runs along many contiguous numbers; stacks of small
+matrices cost several times as much.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple, final
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import Derivatives
 from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
@@ -40,37 +41,36 @@ TARGET = ("target_x", "target_y", "target_z")
 """[m] added to the target's place in the base frame, for cameras on the hand."""
 ALIGNMENT = 0.002  # [m²] weight of the planned rotation in `placed`
 POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+AXES = np.eye(3)
 
 
-class Frame(NamedTuple):
-    """The axes and the origin of a frame, with their coordinates as the first axis, (3, *)."""
+class Vectors(NamedTuple):
+    """Three arrays that rotations mix: the coordinates of points, or the axes of a frame."""
 
     x: FloatArray
     y: FloatArray
     z: FloatArray
-    origin: FloatArray  # [m]
 
-    def moved(self, translation: Iterable[FloatArray | float]) -> "Frame":
-        """Return the frame moved along its own axes [m]."""
-        return self._replace(origin=self.origin + _sum_of(self[:3], translation))
+    def rotated(self, rotation: Iterable[Iterable[FloatArray | float]] | None) -> "Vectors":
+        """Return the sums whose factors are the rows of a matrix; the same for None."""
+        if rotation is None:
+            return self
+        return Vectors(*(_sum_of(self, row) for row in rotation))
 
-    def rotated(self, rotation: FloatArray) -> "Frame":
-        """Return the frame rotated by a matrix, (3, 3), of its own axes."""
-        x, y, z = (_sum_of(self[:3], column) for column in rotation.T)
-        return Frame(x, y, z, self.origin)
-
-    def about_z(self, cosine: FloatArray, sine: FloatArray) -> "Frame":
-        """Return the frame rotated about its z axis."""
-        x, y = _turned(self.x, self.y, cosine, sine)
-        return Frame(x, y, self.z, self.origin)
+    def about_z(self, cosine: FloatArray, sine: FloatArray) -> "Vectors":
+        """Return the same after a rotation of points about z, for axes the opposite one."""
+        x = cosine * self.x - sine * self.y
+        y = sine * self.x + cosine * self.y
+        return Vectors(x, y, self.z)
 
 
-class Seen(NamedTuple):
-    """A robot as its cameras see it."""
+class Chain(NamedTuple):
+    """The way from the target to the frame that cameras are mounted on."""
 
-    mount: Frame  # the frame that they are mounted on
-    frames: list[Frame]  # the base, the frames after each joint, and the flange
-    points: FloatArray  # the target's, (3, p, c, ..., k)
+    cosines: FloatArray  # by joint angle, (n, ..., k)
+    sines: FloatArray
+    joints: list[Vectors]  # the target in the frame of each joint, (p, ..., k) each
+    mount: Vectors  # the target in the frame of the mount
 
 
 @final
@@ -139,8 +139,9 @@ class ParametricModel:
         turn: FloatArray | None = None,
     ) -> FloatArray:
         """Return y, (..., k, m), for joint positions (..., k, n) [rad]; `turn` as in `derivatives`."""
-        seen = self._seen(theta, cameras, joints, turn)
-        return self.planned.measure(_reversed_last(seen.points, 3))
+        target = self._chain(theta, joints).mount
+        points = _in_cameras(target, cameras, _axes_of(cameras, turn))
+        return self.planned.measure(_reversed_last(points, 3))
 
     def derivatives(
         self,
@@ -157,12 +158,30 @@ class ParametricModel:
             joints: (..., k, n) [rad].
             turn: by which the first camera is turned about its optical axis, (..., k) [rad]; None for 0.
         """
-        seen = self._seen(theta, cameras, joints, turn)
-        motions = self._motions(theta, joints, turn, seen)
-        places = _reversed_last(seen.points, 3)
-        y = self.planned.measure(places)
+        arm = self.planned.arm
+        n = arm.n
+        chain = self._chain(theta, joints)
+        axes = _axes_of(cameras, turn)
+        points = _in_cameras(chain.mount, cameras, axes)
+        motions = np.zeros((n + len(self.names), *points.shape))
+        by_parameter = motions[n:]
+        for camera, own in enumerate(axes):
+            seen = by_parameter[:, :, :, camera]
+            mount = Vectors(*np.swapaxes(own, 0, 1)[:, :, None])
+            self._write_motions(seen, chain, mount)
+            first = self.pose_columns.start + len(POSE) * camera
+            pose = seen[first : first + len(POSE)]
+            _write_pose(pose, points[:, :, camera], mount, turn)
+            turn = None  # only the first camera turns
+        by_zero = by_parameter[self._zeros]
+        gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
+        by_angle = np.moveaxis(gear, -1, 0)[:, None, None, None, ..., None]
+        by_gear = np.moveaxis(arm.gear_ratio * joints, -1, 0)[:, None, None, None]
+        np.multiply(by_angle, by_zero, out=motions[:n])
+        np.multiply(by_gear, by_zero, out=by_parameter[self._gears])
+        places = _reversed_last(points, 3)
         rates = self.planned.change(places, _reversed_last(motions, 4))
-        n = self.planned.arm.n
+        y = self.planned.measure(places)
         return Derivatives(y, by_joint=rates[..., :n], by_parameter=rates[..., n:])
 
     def placed(
@@ -184,8 +203,8 @@ class ParametricModel:
         """
         if self.planned.channel.unit != "m" or self.planned.mount != "fixed":
             return cameras
-        frames = self._frames(theta, joints, _identity(joints.ndim))
-        ball = _reversed_last(self._points(theta, frames), 3)[..., 0, 0, :]
+        target = self._chain(theta, joints).mount
+        ball = np.stack([coordinate[0] for coordinate in target], axis=-1)
         total = np.add.reduce(weight, axis=-1)
         share = (weight / total[..., None])[..., None, :]
         middle = share @ ball
@@ -209,42 +228,36 @@ class ParametricModel:
         return self.columns("zero_")
 
     @cached_property
-    def _links(self) -> slice:
-        return self.columns("link_")
+    def _lengths(self) -> list[list[tuple[int, float, int | None]]]:
+        """The axes of each translation with their lengths [m] and the places of these in θ, None for none."""
+        place = self.columns("link_").start
+        links = links_of(self.planned.arm)
+        places = {(row, axis): place + index for index, (_, row, axis) in enumerate(links)}
+        lengths = []
+        for row, translation in enumerate(self.planned.arm.translation.tolist()):
+            own = enumerate(translation)
+            lengths.append([(axis, each, places.get((row, axis))) for axis, each in own if each])
+        return lengths
 
     @cached_property
-    def _lengths(self) -> tuple[IntArray, IntArray]:
-        """Row and axis of each length among the translations."""
-        places = [(row, axis) for _, row, axis in links_of(self.planned.arm)]
-        table: IntArray = np.array(places, dtype=np.int_).reshape(-1, 2)
-        return table[:, 0], table[:, 1]
+    def _rotations(self) -> list[list[list[float]] | None]:
+        """The rows of the fixed rotation before each joint and the flange; None for no rotation."""
+        # A quarter turn has entries of 6e-17, which would cost as much as others.
+        rotations: list[list[list[float]] | None] = []
+        for rotation in np.round(rotation_from_rpy(self.planned.arm.rpy), 15):
+            rows = None
+            if not np.array_equal(rotation, AXES):
+                rows = rotation.tolist()
+            rotations.append(rows)
+        return rotations
 
     @cached_property
-    def _rotations(self) -> FloatArray:
-        """The fixed rotations before each joint and the flange, (n+1, 3, 3)."""
-        return rotation_from_rpy(self.planned.arm.rpy)
+    def _opposite(self) -> list[list[list[float]] | None]:
+        """The opposite rotations."""
+        return [each and np.transpose(each).tolist() for each in self._rotations]
 
-    def _seen(
-        self,
-        theta: FloatArray,
-        cameras: FloatArray,
-        joints: FloatArray,
-        turn: FloatArray | None,
-    ) -> Seen:
-        """Return the robot as each camera sees it."""
-        mount = _mount_in(cameras, turn)
-        base = mount
-        if self.planned.mount == "hand":
-            flange = self._frames(theta, joints, _identity(joints.ndim))[-1]
-            # The camera sees the axes of the flange, in which those of the base are known.
-            coordinates = zip(flange.x, flange.y, flange.z, strict=True)
-            x, y, z = (_sum_of(mount[:3], each) for each in coordinates)
-            base = Frame(x, y, z, mount.origin - _sum_of((x, y, z), flange.origin))
-        frames = self._frames(theta, joints, base)
-        return Seen(mount, frames, self._points(theta, frames))
-
-    def _frames(self, theta: FloatArray, joints: FloatArray, base: Frame) -> list[Frame]:
-        """Return the base, the frames after each joint and the flange."""
+    def _chain(self, theta: FloatArray, joints: FloatArray) -> Chain:
+        """Return the way from the target to the frame that cameras are mounted on."""
         arm = self.planned.arm
         gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
         offset = arm.joint_offset + theta[..., self._zeros]
@@ -252,119 +265,116 @@ class ParametricModel:
         angles = np.ascontiguousarray(np.moveaxis(angles, -1, 0))
         cosines = np.cos(angles)
         sines = np.sin(angles)
-        frames = [base]
-        for row in range(arm.n + 1):
-            frame = frames[-1].moved(self._translation(theta, row)).rotated(self._rotations[row])
-            if row < arm.n:
-                frame = frame.about_z(cosines[row], sines[row])
-            frames.append(frame)
-        return frames
-
-    def _translation(self, theta: FloatArray, row: int) -> list[FloatArray | float]:
-        """Return the translation before a joint, in which lengths deviate."""
-        translation: list[FloatArray | float] = list(self.planned.arm.translation[row])
-        rows, axes = self._lengths
-        for index in np.flatnonzero(rows == row):
-            stretch = 1.0 + theta[..., self._links][..., index, None]
-            translation[axes[index]] = translation[axes[index]] * stretch
-        return translation
-
-    def _target(self, frames: list[Frame]) -> Frame:
-        """Return the frame that the target is fixed to."""
+        marks = self.planned.marks.T.reshape(3, -1, *(1,) * (angles.ndim - 1))
+        target = Vectors(*(own + theta[..., axis, None] for axis, own in enumerate(marks)))
+        places = []
         if self.planned.mount == "fixed":
-            return frames[-1]
-        return frames[0]
+            for row in reversed(range(arm.n + 1)):
+                if row < arm.n:
+                    target = target.about_z(cosines[row], sines[row])
+                    places.append(target)
+                target = target.rotated(self._rotations[row])
+                target = self._translated(target, theta, row, 1.0)
+            return Chain(cosines, sines, places[::-1], target)
+        # From the base to the flange, all is done the opposite way.
+        for row in range(arm.n + 1):
+            target = self._translated(target, theta, row, -1.0)
+            target = target.rotated(self._opposite[row])
+            if row < arm.n:
+                target = target.about_z(cosines[row], -sines[row])
+                places.append(target)
+        return Chain(cosines, sines, places, target)
 
-    def _points(self, theta: FloatArray, frames: list[Frame]) -> FloatArray:
-        """Return the points of the target, (3, p, c, ..., k)."""
-        frame = self._target(frames)
-        shift = np.moveaxis(theta[..., :3], -1, 0)[..., None]
-        points = []
-        for mark in self.planned.marks:
-            place = [own + more for own, more in zip(mark, shift, strict=True)]
-            points.append(frame.moved(place).origin)
-        return np.stack(points, axis=1)
+    def _translated(self, target: Vectors, theta: FloatArray, row: int, sign: float) -> Vectors:
+        """Return the target translated by a link, ±1 times."""
+        coordinates = list(target)
+        for axis, length, place in self._lengths[row]:
+            shift: FloatArray | float = sign * length
+            if place is not None:
+                shift = shift * (1.0 + theta[..., place, None])
+            coordinates[axis] = coordinates[axis] + shift
+        return Vectors(*coordinates)
 
-    def _motions(
-        self, theta: FloatArray, joints: FloatArray, turn: FloatArray | None, seen: Seen
-    ) -> FloatArray:
-        """Return the motions of points by joints and parameters, (n + P, 3, p, c, ..., k)."""
-        arm = self.planned.arm
-        n = arm.n
-        points = seen.points
-        frames = seen.frames
-        motions = np.zeros((n + len(self.names), *points.shape))
-        by_joint = motions[:n]
-        by_parameter = motions[n:]
-        sign = 1.0
-        if self.planned.mount == "hand":
-            # Seen from the hand, the target moves the opposite way.
-            sign = -1.0
-        gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
-        by_gear = by_parameter[self._gears]
-        by_zero = by_parameter[self._zeros]
-        for joint, frame in enumerate(frames[1:-1]):
-            lever = points - frame.origin[:, None]
-            motion = _cross(sign * frame.z[:, None], lever)
-            by_zero[joint] = motion
-            by_joint[joint] = gear[..., joint, None] * motion
-            by_gear[joint] = arm.gear_ratio[joint] * joints[..., joint] * motion
-        for motion, row, axis in zip(by_parameter[self._links], *self._lengths, strict=True):
-            # The i-th translation is along the axes of the frame before it.
-            motion[...] = sign * arm.translation[row, axis] * frames[row][axis][:, None]
-        target = self._target(frames)
-        for motion, direction in zip(by_parameter[:3], target[:3], strict=True):
-            motion[...] = direction[:, None]
-        self._write_poses(by_parameter[self.pose_columns], turn, seen)
-        return motions
+    def _write_motions(self, motions: FloatArray, chain: Chain, axes: Vectors) -> None:
+        """Write the motions of points by all parameters but gears and poses, (P, 3, p, ..., k), as a camera sees them.
 
-    def _write_poses(self, motions: FloatArray, turn: FloatArray | None, seen: Seen) -> None:
-        """Write the motions of points with the poses of the cameras, (6 c, 3, p, c, ..., k)."""
-        for camera in range(seen.points.shape[2]):
-            points = seen.points[:, :, camera]
-            x, y, z = (_cross(points, axis) for axis in _identity(points.ndim - 1)[:3])
-            if turn is not None and camera == 0:
-                # δ turns the camera before its own turn: its axes are those of the camera turned back.
-                x, y = _turned(x, y, np.cos(turn), -np.sin(turn))
-            first = len(POSE) * camera
-            own = motions[first : first + len(POSE), :, :, camera]
-            own[:3] = (x, y, z)
-            for motion, axis in zip(own[3:], seen.mount[:3], strict=True):
-                motion[...] = -axis[:, None, camera]
+        Args:
+            motions: into which they are written.
+            chain: from the target to the mount.
+            axes: those of the mount, as the camera sees them.
+        """
+        n = self.planned.arm.n
+        by_zero = motions[self._zeros]
+        if self.planned.mount == "fixed":
+            for row in range(n + 1):
+                self._write_lengths(motions, axes, row, 1.0)
+                axes = axes.rotated(self._opposite[row])
+                if row < n:
+                    x, y, _ = chain.joints[row]
+                    np.subtract(x * axes.y, y * axes.x, out=by_zero[row])
+                    axes = axes.about_z(chain.cosines[row], -chain.sines[row])
+        else:
+            for row in reversed(range(n + 1)):
+                if row < n:
+                    x, y, _ = chain.joints[row]
+                    np.subtract(y * axes.x, x * axes.y, out=by_zero[row])
+                    axes = axes.about_z(chain.cosines[row], chain.sines[row])
+                axes = axes.rotated(self._rotations[row])
+                self._write_lengths(motions, axes, row, -1.0)
+        for motion, axis in zip(motions[:3], axes, strict=True):
+            motion[...] = axis
+
+    def _write_lengths(self, motions: FloatArray, axes: Vectors, row: int, sign: float) -> None:
+        """Write the motions by the lengths of a link, of which a translation is ±1 times."""
+        for axis, length, place in self._lengths[row]:
+            if place is not None:
+                np.multiply(sign * length, axes[axis], out=motions[place])
 
 
-def _mount_in(cameras: FloatArray, turn: FloatArray | None) -> Frame:
-    """Return the frame that cameras are mounted on as each of them sees it, (3, c, ..., k or 1).
+def _axes_of(cameras: FloatArray, turn: FloatArray | None) -> list[FloatArray]:
+    """Return the axes of each camera in the frame of the mount, (3, 3, ..., k or 1).
 
     Args:
-        cameras: (..., c, 4, 4), in the frame of the mount.
+        cameras: (..., c, 4, 4), in the same frame.
         turn: by which the first camera is turned about its optical axis, (..., k) [rad]; None for 0.
     """
-    rows = np.moveaxis(cameras[..., :3, :], (-2, -1, -3), (0, 1, 2))[..., None]
-    R = rows[:, :3]
-    place = rows[:, 3]
+    axes = list(np.moveaxis(cameras[..., :3, :3], (-3, -1, -2), (0, 1, 2))[..., None])
     if turn is not None:
-        angles = np.zeros((cameras.shape[-3], *turn.shape))
-        angles[0] = turn
-        first, second = _turned(R[:, 0], R[:, 1], np.cos(angles), np.sin(angles))
-        R = np.stack([first, second, np.broadcast_to(R[:, 2], first.shape)], axis=1)
-    x, y, z = R
-    return Frame(x, y, z, -_sum_of((x, y, z), place))
+        turned = Vectors(*axes[0]).about_z(np.cos(turn), -np.sin(turn))
+        axes[0] = np.stack(np.broadcast_arrays(*turned))
+    return axes
 
 
-def _turned(
-    x: FloatArray, y: FloatArray, cosine: FloatArray, sine: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return two axes after a rotation about the third one."""
-    first = cosine * x + sine * y
-    second = cosine * y - sine * x
-    return first, second
+def _in_cameras(target: Vectors, cameras: FloatArray, axes: list[FloatArray]) -> FloatArray:
+    """Return the target in each camera, (3, p, c, ..., k), by its place in the frame of the mount."""
+    seen = []
+    for camera, own in enumerate(axes):
+        place = cameras[..., camera, :3, 3, None]
+        away = [each - place[..., axis, :] for axis, each in enumerate(target)]
+        seen.append(np.stack(Vectors(*away).rotated(own)))
+    return np.stack(seen, axis=2)
 
 
-def _identity(axes: int) -> Frame:
-    """Return a frame that is seen from itself, with so many axes of length 1 after the coordinates."""
-    x, y, z = np.eye(3).reshape(3, 3, *(1,) * axes)
-    return Frame(x, y, z, np.zeros_like(x))
+def _write_pose(
+    motions: FloatArray, points: FloatArray, axes: Vectors, turn: FloatArray | None
+) -> None:
+    """Write the motions of points by the pose of a camera, (6, 3, p, ..., k).
+
+    Args:
+        motions: into which they are written.
+        points: as the camera sees them, (3, p, ..., k).
+        axes: those of the mount, as the camera sees them.
+        turn: by which it is turned, (..., k) [rad]; None for 0.
+    """
+    x, y, z = points
+    none = np.zeros_like(x)
+    turns = Vectors(np.stack([none, z, -y]), np.stack([-z, none, x]), np.stack([y, -x, none]))
+    if turn is not None:
+        # δ turns the camera before its own turn: its axes are those of the camera turned back.
+        turns = turns.about_z(np.cos(turn), np.sin(turn))
+    motions[:3] = turns
+    for motion, axis in zip(motions[3:], axes, strict=True):
+        np.negative(axis, out=motion)
 
 
 def _reversed_last(array: FloatArray, count: int) -> FloatArray:
@@ -373,27 +383,15 @@ def _reversed_last(array: FloatArray, count: int) -> FloatArray:
     return np.moveaxis(array, source, [-1 - axis for axis in source])
 
 
-def _sum_of(
-    vectors: tuple[FloatArray, FloatArray, FloatArray], factors: Iterable[FloatArray | float]
-) -> FloatArray:
-    """Return Σ f v of vectors (3, *)."""
-    total: FloatArray = np.zeros(())
+def _sum_of(vectors: Iterable[FloatArray], factors: Iterable[FloatArray | float]) -> FloatArray:
+    """Return Σ f v."""
+    terms = []
     for vector, factor in zip(vectors, factors, strict=True):
         # Most rotations of an arm are about one axis: many factors are 0 or 1.
-        if isinstance(factor, float) and factor == 0.0:
-            continue
-        term = vector
-        if not (isinstance(factor, float) and factor == 1.0):
-            term = factor * vector
-        total = total + term
-    return total
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a × b of vectors (3, *)."""
-    a1, a2, a3 = a
-    b1, b2, b3 = b
-    x = a2 * b3 - a3 * b2
-    y = a3 * b1 - a1 * b3
-    z = a1 * b2 - a2 * b1
-    return np.stack([x, y, z])
+        if not isinstance(factor, float):
+            terms.append(factor * vector)
+        elif factor == 1.0:
+            terms.append(vector)
+        elif factor != 0.0:
+            terms.append(factor * vector)
+    return reduce(np.add, terms)
