@@ -65,12 +65,12 @@ class Frozen(Controller):
             )
             return learned
         # Members that were never fitted are not searched any more, either.
-        idle = state._replace(fitted=np.zeros_like(state.fitted))
+        idle = state._replace(begun=np.full_like(state.begun, -1))
         never = np.zeros_like(due)
         moved: CalibrationState = self._calibration_update(
             idle, observation, never, regression, late
         )
-        return moved._replace(fitted=state.fitted)
+        return moved._replace(begun=state.begun, used=state.used)
 
     def _regressed(
         self,

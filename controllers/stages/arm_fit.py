@@ -101,14 +101,22 @@ class Members(NamedTuple):
     turning: FloatArray  # ω, (..., E) [rad/s]
     damping: FloatArray  # λ of Levenberg and Marquardt, (..., E)
     cost: FloatArray  # (..., E)
-
-
-class Trial(NamedTuple):
-    """New members, whose first iterations take noise for larger, so that wrong arms come near."""
-
-    members: Members
     variance: FloatArray  # σ² of the residuals with which they begin, (..., E)
-    iterations: IntArray  # made so far, (...)
+
+    def beside(self, others: Members) -> Members:
+        """Return these members and others behind them."""
+        axis = self.cost.ndim - 1
+        pairs = zip(self, others, strict=True)
+        return Members(*(np.concatenate(pair, axis=axis) for pair in pairs))
+
+    def picked(self, kept: IntArray) -> Members:
+        """Return the members of indices `kept`, (..., k)."""
+        return Members(*(pick(each, kept, axes=1) for each in self))
+
+    def best(self, count: int) -> IntArray:
+        """Return the indices of the members of the least costs, (..., count)."""
+        finite = np.where(np.isfinite(self.cost), self.cost, np.finfo(np.float64).max)
+        return np.argsort(finite, axis=-1)[..., :count]
 
 
 class Geared(NamedTuple):
@@ -142,24 +150,26 @@ def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatA
     last = path.shape[-2] - 1
     x = np.clip(last - delay / grid, 0.0, last)
     first = np.minimum(x.astype(np.int_), last - 1)
-    u = (x - first)[..., None, None]
-    # A delay is the same for all frames, so that whole rows of positions are taken.
-    rows = np.moveaxis(path, -2, delay.ndim - 1)
-    index = np.clip(first[..., None] + SUPPORT, 0, last)
-    support = pick(rows, index, axes=2)
-    before, begin, end, after = np.moveaxis(support, delay.ndim, 0)
+    # A spline is a sum of four rows. Their weights are the splines of unit vectors, the same for all frames.
+    before, begin, end, after = np.eye(4)
     slope_begin = 0.5 * (end - before)
     slope_end = 0.5 * (after - begin)
     # At the ends of the path the slope is that of the last interval.
-    ends = (first + 2 > last)[..., None, None]
-    begins = (first == 0)[..., None, None]
-    slope_end = np.where(ends, end - begin, slope_end)
-    slope_begin = np.where(begins, end - begin, slope_begin)
+    slope_end = np.where((first + 2 > last)[..., None], end - begin, slope_end)
+    slope_begin = np.where((first == 0)[..., None], end - begin, slope_begin)
+    u = (x - first)[..., None]
     cubic = 2.0 * begin - 2.0 * end + slope_begin + slope_end
     square = 3.0 * (end - begin) - 2.0 * slope_begin - slope_end
-    chord = (cubic * u + square) * u + slope_begin
+    position = ((cubic * u + square) * u + slope_begin) * u + begin
     slope = (3.0 * cubic * u + 2.0 * square) * u + slope_begin
-    return begin + chord * u, slope / grid
+    weights = np.stack([position, slope / grid], axis=-2)
+    rows = np.moveaxis(path, -2, delay.ndim - 1)
+    support = pick(rows, np.clip(first[..., None] + SUPPORT, 0, last), axes=2)
+    frames = support.shape[-2:]
+    found = weights @ support.reshape(*support.shape[:-2], -1)
+    return found[..., 0, :].reshape(*delay.shape, *frames), found[..., 1, :].reshape(
+        *delay.shape, *frames
+    )
 
 
 def each_row(frames: Frames, function: Callable[[FloatArray], FloatArray]) -> Frames:
@@ -334,16 +344,21 @@ class Fit:
             turning=np.zeros(size),
             damping=np.full(size, FIRST_DAMPING),
             cost=np.full(size, np.inf),
+            variance=np.zeros(size),
         )
 
-    def aligned(self, members: Members, frames: Frames) -> Members:
-        """Return members whose cameras are placed where their arms fit the frames best, where that has a solution."""
+    def aligned(self, members: Members, frames: Frames) -> tuple[Members, FloatArray]:
+        """Return members whose cameras are placed where their arms fit the frames best, with their residuals.
+
+        Under sensing for which that has no solution cameras stay where they are.
+        """
         q, _ = self.exposed(members, frames.path)
         weight = np.minimum.reduce(frames.weight, axis=-1)[..., None, :]
         features = self.scale * frames.feature[..., None, :, :]
         theta = members.theta[..., self._model]
         cameras = self.model.placed(theta, members.cameras, q.joints, features, weight)
-        return members._replace(cameras=cameras)
+        placed = members._replace(cameras=cameras)
+        return placed, self._residual_at(placed, frames, q)
 
     def screened(
         self, members: Members, frames: Frames, variance: FloatArray, count: int
@@ -358,14 +373,12 @@ class Fit:
             variance: σ² of the comparison, (..., E).
             count: how many are returned.
         """
-        members = self.aligned(members, frames)
-        residual = self.residual(members, frames)
+        members, residual = self.aligned(members, frames)
         square = squared(residual) / variance[..., None]
         cost = np.add.reduce(np.log1p(square / STUDENT), axis=-1)
-        best = np.argsort(cost, axis=-1)[..., :count]
-        return Members(*(pick(each, best, axes=1) for each in members))
+        return members.picked(np.argsort(cost, axis=-1)[..., :count])
 
-    def begun(self, members: Members, frames: Frames, floor: FloatArray) -> Trial:
+    def begun(self, members: Members, frames: Frames, floor: FloatArray) -> Members:
         """Return new members with their cameras where these fit their arms, before any iteration.
 
         Args:
@@ -373,30 +386,33 @@ class Fit:
             frames: which they are to fit.
             floor: σ² of residuals that are but noise, (..., 1).
         """
-        members = self.aligned(members, frames)
-        square = squared(self.residual(members, frames))
-        variance = np.maximum(floor, np.median(square, axis=-1) / 3.0)
-        none = np.zeros(variance.shape[:-1], dtype=np.int_)[()]
-        return Trial(members, variance, none)
+        members, residual = self.aligned(members, frames)
+        variance = np.maximum(floor, np.median(squared(residual), axis=-1) / 3.0)
+        return members._replace(variance=variance)
 
     def annealed(
-        self, trial: Trial, frames: Frames, lateness: FloatArray, floor: FloatArray
-    ) -> Trial:
-        """Return new members after an iteration.
+        self,
+        members: Members,
+        made: IntArray,
+        frames: Frames,
+        lateness: FloatArray,
+        floor: FloatArray,
+    ) -> Members:
+        """Return new members after an iteration; the first ones take noise for larger, so that wrong arms come near.
 
         Args:
-            trial: before.
-            frames: which it fits.
+            members: before.
+            made: iterations before, (...).
+            frames: which they fit.
             lateness: s, (...) [s].
             floor: σ² of residuals that are but noise, (..., 1).
         """
-        least = np.broadcast_to(floor, trial.variance.shape)
-        made = trial.iterations[..., None]
-        larger = np.maximum(least, 0.25**made * trial.variance)
+        least = np.broadcast_to(floor, members.variance.shape)
+        made = made[..., None]
+        larger = np.maximum(least, 0.25**made * members.variance)
         variance = np.where(made < ANNEALED - 1, larger, least)
-        fitted = self.fitted(trial.members, frames)
-        members, _ = self.iterated(trial.members, frames, fitted, lateness, variance)
-        return trial._replace(members=members, iterations=trial.iterations + 1)
+        members, _ = self.iterated(members, frames, lateness, variance)
+        return members
 
     def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
         """Return joints behind gears at the exposures of frames with paths (..., F, J, 2n), and their velocities."""
@@ -463,6 +479,9 @@ class Fit:
     def residual(self, members: Members, frames: Frames) -> FloatArray:
         """Return y − h of members at the frames, (..., E, m, F)."""
         q, _ = self.exposed(members, frames.path)
+        return self._residual_at(members, frames, q)
+
+    def _residual_at(self, members: Members, frames: Frames, q: Geared) -> FloatArray:
         turn = members.turning[..., None] * frames.time[..., None, :]
         return self._missed(frames, self.feature(members, q, turn))
 
@@ -529,17 +548,13 @@ class Fit:
         return whole, np.concatenate([pull, -further * offsets], axis=-1)
 
     def iterated(
-        self,
-        members: Members,
-        frames: Frames,
-        fitted: Fitted,
-        lateness: FloatArray,
-        variance: FloatArray,
-    ) -> tuple[Members, FloatArray]:
+        self, members: Members, frames: Frames, lateness: FloatArray, variance: FloatArray
+    ) -> tuple[Members, Fitted]:
         """Return members after an iteration, with their residuals; a step that raises the cost is not made.
 
-        The motions of the features, along which frames are late, are those before the step.
+        The motions of the features, along which frames are late, and the derivatives are those before the step.
         """
+        fitted = self.fitted(members, frames)
         residual, rates = whitened(fitted, lateness, variance)
         cost, square = self.costs(members, fitted, lateness, variance)
         weight = 1.0 / (1.0 + square / STUDENT) / variance[..., None]
@@ -566,7 +581,7 @@ class Fit:
         new = new._replace(
             damping=np.clip(damping, *DAMPINGS), cost=np.where(better, tried_cost, cost)
         )
-        return new, where(better, found, fitted.residual)
+        return new, fitted._replace(residual=where(better, found, fitted.residual))
 
     def _shrink(self, step: FloatArray) -> FloatArray:
         """Return the share of a step (..., P + 2) that moves no zero too far."""

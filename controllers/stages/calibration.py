@@ -7,6 +7,10 @@ frames to their noise.
 Few frames fit many arms, and of those that are far away an iteration finds the right one slowly. While no member
 explains the frames, all of them make several iterations from frame to frame, and the worst ones are replaced by the
 best of many new arms. With more frames there are fewer members, so that the work of an iteration stays the same.
+
+The work of a frame is spread over the periods to the next one, so that none of them takes long: the frame is taken in
+during the first one, members are fitted to it in the next one, and other arms are searched for in those that remain. At
+20 Hz all of that falls into one period.
 """
 
 from __future__ import annotations
@@ -32,7 +36,6 @@ from servobench.controllers.stages.arm_fit import (
     Fitted,
     Frames,
     Members,
-    Trial,
     added,
     at_latency,
     first,
@@ -73,16 +76,12 @@ EXPLAINED = 1.3  # [1] residuals in σ up to which frames are explained
 LEAST_LATENESS = 0.012  # [s] below which there is none
 FAST = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
 MOVE_ERROR = 3.0  # [1] error of a frame in σ from which on it tells a moved camera
-UNEXPLAINED = 1.6  # [1] residuals in σ from which on new members are tried
-LAST_TRIAL = 30.0  # [s]
 MIN_EXPONENT = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL = 1e-12  # [1] sum of weights by which they are divided
 CANDIDATES = 8  # new members that are tried at once
 SCREENED = 256  # new members at most of which these are the best, before any iteration
 SCREENING_WORK = 4096  # product of them and frames that is not exceeded
 SCREENING = 25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
-TRIAL_ITERATIONS = 12  # iterations of a trial
-TRIAL_WORK = 960  # product of candidates, frames and iterations at a frame that is not exceeded
 
 
 class Regressed(NamedTuple):
@@ -119,7 +118,8 @@ class CalibrationState(NamedTuple):
     members: Members
     share: FloatArray  # weight of each member, (..., E)
     bias: FloatArray  # mean residual of each member, (..., E, m)
-    fitted: BoolArray  # (...), whether anything was fitted
+    begun: IntArray  # iterations with which members begin, (...): -1 before, `ANNEALED` once they are fitted
+    phase: IntArray  # periods since the last frame, (...)
     lateness: FloatArray  # s, (...) [s]
     across: FloatArray  # deviation of residuals across the motion, (...); 0 where it is unknown
     rms: FloatArray  # deviation of the residuals of the best member, (...)
@@ -130,8 +130,12 @@ class CalibrationState(NamedTuple):
     moves: IntArray  # those of the regression at the last frame, (...)
     passed: IntArray  # frames since the last iteration, (...)
     spawned: IntArray  # members begun so far, (...)
-    trial: Trial
     past: tuple[Known, ...]  # the last `HORIZON` frames, the oldest first
+
+    @property
+    def fitted(self) -> BoolArray:
+        """Whether members are fitted, (...)."""
+        return np.equal(self.begun, ANNEALED)
 
 
 class Ahead(NamedTuple):
@@ -153,9 +157,13 @@ class Calibration:
         self._n = knowledge.spec.n
         self.fit = Fit(model, knowledge.unit, self._period)
         self._periods = 1 + (self.fit.rows - 1) * self.fit.stride
-        frame_periods = max(1, whole_periods(MOTION_TIME, self._period))
-        self._frame_time = frame_periods * self._period
-        self._iterations = math.ceil((SEARCH_ITERATIONS - 1) / frame_periods)
+        self._spread = max(
+            1, whole_periods(MOTION_TIME, self._period)
+        )  # periods from frame to frame
+        self._frame_time = self._spread * self._period
+        # Phases in which members are fitted and arms are searched for
+        self._fitting = min(1, self._spread - 1)
+        self._searching = min(2, self._spread - 1)
 
     def start(self, observation: Observation) -> CalibrationState:
         """Return the state before any frame."""
@@ -185,7 +193,8 @@ class Calibration:
             members=members,
             share=np.full(size, 1.0 / FIRST_MEMBERS),
             bias=np.zeros((*size, m)),
-            fitted=no,
+            begun=zero - 1,
+            phase=zero + self._spread,
             lateness=none,
             across=none,
             rms=none,
@@ -196,11 +205,6 @@ class Calibration:
             moves=zero,
             passed=zero,
             spawned=zero + FIRST_MEMBERS,
-            trial=Trial(
-                members=fit.spawned(lead, zero, CANDIDATES, none),
-                variance=np.zeros((*lead, CANDIDATES)),
-                iterations=zero + TRIAL_ITERATIONS,
-            ),
             past=(),
         )
 
@@ -237,9 +241,9 @@ class Calibration:
         if state.share.shape[-1] > size:
             state = self._reduced(state, size)
         past = state.past
-        state = state._replace(past=())
-        state = branch(due, self._learn, state, observation, regression, past, elapsed, late)
-        state = branch(~due & self._unexplained(state), self._searched, state, elapsed, state.noise)
+        state = state._replace(past=(), phase=state.phase + 1)
+        state = branch(due, self._taken_in, state, observation, regression, past, late)
+        state = self._worked(state, regression.delay)
         return state._replace(past=self._remembered(past, state, due, regression))
 
     def _most_frames(self, elapsed: float) -> int:
@@ -252,33 +256,18 @@ class Calibration:
             return np.zeros_like(state.fitted)
         return np.asarray(state.fitted & (state.rms > EXPLAINED * state.noise))
 
-    def _searched(
-        self, state: CalibrationState, elapsed: float, noise: FloatArray
-    ) -> CalibrationState:
-        """Return the state after further iterations, of which each period makes a part."""
-        fit = self.fit
-        frames = self._in_use(state, elapsed)
-        variance = np.broadcast_to(_floor(noise), state.share.shape)
-        members = state.members
-        for _ in range(self._iterations):
-            fitted = fit.fitted(members, frames)
-            members, _ = fit.iterated(members, frames, fitted, state.lateness, variance)
-        return state._replace(members=members)
-
-    def _learn(
+    def _taken_in(
         self,
         state: CalibrationState,
         observation: Observation,
         regression: Regressed,
         past: tuple[Known, ...],
-        elapsed: float,
         late: FloatArray | None,
     ) -> CalibrationState:
-        """Return the state after a frame."""
+        """Return the state with a frame more, by which earlier predictions are judged."""
         delay = regression.delay
         path = self._path(state.history, late)
-        lead = state.travel.shape
-        time = np.full(lead, elapsed)[()]
+        time = np.full(state.travel.shape, state.elapsed)[()]
         instant = time
         if late is not None:
             # Time and path are those at which it would have come if it were not late.
@@ -290,50 +279,57 @@ class Calibration:
         known = (state.lateness > 0.0) & (state.across > 0.0)
         across = np.minimum(np.maximum(state.across, NOISE[0]), noise)
         noise = np.where(known, across, noise)
-        state = state._replace(frames=frames, noise=noise)
+        state = state._replace(frames=frames, noise=noise, phase=np.zeros_like(state.phase))
         if past:
             state, missed = self._judged(state, y, path, instant, delay, past)
             camera_moved = missed & (regression.moves > state.moves)
             state = branch(camera_moved, self._after_move, state._replace(moves=regression.moves))
             frames = state.frames
-        many = frames.number >= MANY_FRAMES
-        level = np.where(
-            many & state.fitted, np.minimum(noise, EXPLAINED * state.rms + 0.2e-3), noise
-        )
-
         moved = norm(y - frames.feature[..., 0, :]) > MIN_MOTION * noise
-        begins = ~state.fitted & moved & (frames.number > 2)
-        state = branch(begins, self._begun, state, elapsed, delay, level)
-        state = state._replace(passed=state.passed + 1)
-        explained = many & (state.rms < EXPLAINED * noise)
+        begins = (state.begun < 0) & moved & (frames.number > 2)
+        return branch(begins, self._begun, state._replace(passed=state.passed + 1), delay)
+
+    def _worked(self, state: CalibrationState, delay: FloatArray) -> CalibrationState:
+        """Return the state after the work of a period: a part of what the last frame asks for."""
+        phase = state.phase
+        noise = state.noise
+        many = state.frames.number >= MANY_FRAMES
+        least = np.minimum(noise, EXPLAINED * state.rms + 0.2e-3)
+        level = np.where(many & state.fitted, least, noise)
+
+        for _ in range(math.ceil(ANNEALED / self._spread)):
+            begins = (state.begun > 0) | ((state.begun == 0) & (phase >= self._fitting))
+            state = branch(begins & ~state.fitted, self._annealed, state, level)
         unexplained = self._unexplained(state)
-        state = branch(unexplained, self._refreshed, state, elapsed, delay, level)
-        state = branch(unexplained, self._searched, state, elapsed, level)
+        searches = unexplained & (phase >= self._searching)
+        state = branch(searches & (phase < self._spread), self._refreshed, state, delay, level)
+        for _ in range(max(1, (SEARCH_ITERATIONS - 1) // self._spread)):
+            state = branch(searches, self._searched, state, level)
+
+        explained = many & (state.rms < EXPLAINED * noise)
+        fits = phase == self._fitting
         iterates = state.fitted & (~explained | (state.passed >= ITERATION_INTERVAL))
-        state = branch(iterates, self._continued, state, elapsed, level)
-        used = self._trusted(state)
-        lost = state.fitted & (state.rms > UNEXPLAINED * noise + FLOOR)
-        later = (time > SEARCH_TIME) & (time < LAST_TRIAL)
-        new = lost & (state.trial.iterations == TRIAL_ITERATIONS) & later
-        state = branch(new, self._try_more, state._replace(used=used), elapsed, delay, level)
-        affordable = TRIAL_WORK // (CANDIDATES * self._most_frames(elapsed))
-        for _ in range(min(max(affordable, 1), TRIAL_ITERATIONS)):
-            tries = state.trial.iterations < TRIAL_ITERATIONS
-            state = branch(tries, self._tried, state, elapsed, level)
-        return state
+        state = branch(fits & iterates, self._continued, state, level)
+        used = np.where(fits, self._trusted(state), state.used & state.fitted)
+        return state._replace(used=used)
+
+    def _searched(self, state: CalibrationState, noise: FloatArray) -> CalibrationState:
+        """Return the state after a further iteration of all members."""
+        frames = self._in_use(state)
+        variance = np.broadcast_to(_floor(noise), state.share.shape)
+        members, _ = self.fit.iterated(state.members, frames, state.lateness, variance)
+        return state._replace(members=members)
 
     def _after_move(self, state: CalibrationState) -> CalibrationState:
         """Return the state after a move of the camera: arms stay as they are, of the frames the last ones."""
         members = state.members
         damping = np.full_like(members.damping, FIRST_DAMPING)
         arms = members._replace(damping=damping, centre=members.theta)
-        ended = np.full_like(state.trial.iterations, TRIAL_ITERATIONS)
-        trial = state.trial._replace(iterations=ended)
         frames = last(state.frames, MOVED_FRAMES)
-        state = state._replace(frames=frames, members=arms, trial=trial)
-        fitted = np.zeros_like(state.fitted)
+        state = state._replace(frames=frames, members=arms)
+        begun = np.full_like(state.begun, -1)
         unknown = np.full_like(state.errors, np.nan)
-        return state._replace(fitted=fitted, errors=unknown)
+        return state._replace(begun=begun, errors=unknown)
 
     def _joints(self, rows: FloatArray) -> FloatArray:
         """Return joint positions alone, (..., n), of rows (..., 2n) of the history."""
@@ -347,33 +343,29 @@ class Calibration:
         ago = late[..., None] / self._period + stride * np.arange(self.fit.rows)
         return rows_ago(history, ago)[..., ::-1, :]
 
-    def _in_use(self, state: CalibrationState, elapsed: float) -> Frames:
+    def _in_use(self, state: CalibrationState) -> Frames:
         """Return the frames, without rows for which there were too few periods so far."""
-        return first(state.frames, self._most_frames(elapsed))
+        return first(state.frames, self._most_frames(state.elapsed))
 
-    def _begun(
-        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
-    ) -> CalibrationState:
-        """Return the state with members fitted for the first time, or anew after a move of the camera."""
-        frames = self._in_use(state, elapsed)
+    def _begun(self, state: CalibrationState, delay: FloatArray) -> CalibrationState:
+        """Return the state in which members begin for the first time, or anew after a move of the camera."""
         late = np.broadcast_to(delay[..., None], state.share.shape)
         members = state.members._replace(latency=late)
-        floor = _floor(noise)
-        trial = self.fit.begun(members, frames, floor)
-        for _ in range(ANNEALED):
-            trial = self.fit.annealed(trial, frames, state.lateness, floor)
-        return state._replace(members=trial.members, fitted=np.ones_like(state.fitted))
+        members = self.fit.begun(members, self._in_use(state), _floor(state.noise))
+        return state._replace(members=members, begun=np.zeros_like(state.begun))
 
-    def _continued(
-        self, state: CalibrationState, elapsed: float, noise: FloatArray
-    ) -> CalibrationState:
+    def _annealed(self, state: CalibrationState, noise: FloatArray) -> CalibrationState:
+        """Return the state after an iteration of members that begin."""
+        frames = self._in_use(state)
+        floor = _floor(noise)
+        members = self.fit.annealed(state.members, state.begun, frames, state.lateness, floor)
+        return state._replace(members=members, begun=state.begun + 1)
+
+    def _continued(self, state: CalibrationState, noise: FloatArray) -> CalibrationState:
         """Return the state after an iteration, with weights, biases and the noise of frames that members imply."""
-        fit = self.fit
-        frames = self._in_use(state, elapsed)
+        frames = self._in_use(state)
         variance = np.broadcast_to(_floor(noise), state.share.shape)
-        fitted = fit.fitted(state.members, frames)
-        members, residual = fit.iterated(state.members, frames, fitted, state.lateness, variance)
-        fitted = fitted._replace(residual=residual)
+        members, fitted = self.fit.iterated(state.members, frames, state.lateness, variance)
         cost = members.cost
         best = cost.argmin(axis=-1)
         excess = cost - np.minimum.reduce(cost, axis=-1)[..., None]
@@ -385,9 +377,8 @@ class Calibration:
         square = squared(residual)
         own = pick(square, best)
         rms = np.sqrt(_median_of(own, there) / MEDIAN_SQUARE)
-        bias = self._bias(
-            residual, square, frames, elapsed, np.minimum(noise, 1.5 * rms + 0.2e-3), noise
-        )
+        level = np.minimum(noise, 1.5 * rms + 0.2e-3)
+        bias = self._bias(residual, square, frames, state.elapsed, level, noise)
         passed = np.zeros_like(state.passed)
         state = state._replace(rms=rms, bias=bias, passed=passed)
         return self._lateness(state, fitted, best, there)
@@ -499,62 +490,31 @@ class Calibration:
         better = state.errors[..., 1] < gate * state.errors[..., 0]
         return np.asarray(state.fitted & better)
 
-    def _try_more(
-        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
-    ) -> CalibrationState:
-        """Return the state in which a trial begins."""
-        state, new = self._screened(state, elapsed, delay, noise)
-        trial = self.fit.begun(new, self._in_use(state, elapsed), _floor(noise))
-        return state._replace(trial=trial)
-
     def _refreshed(
-        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
+        self, state: CalibrationState, delay: FloatArray, noise: FloatArray
     ) -> CalibrationState:
-        """Return the state with new members for the worst ones."""
-        state, new = self._screened(state, elapsed, delay, noise)
-        return self._together(self._reduced(state, state.share.shape[-1] - CANDIDATES), new)
-
-    def _screened(
-        self, state: CalibrationState, elapsed: float, delay: FloatArray, noise: FloatArray
-    ) -> tuple[CalibrationState, Members]:
-        """Return new members that fit the frames best of many before any iteration."""
-        most = SCREENING_WORK // self._most_frames(elapsed)
-        count = min(max(most, CANDIDATES), SCREENED)
+        """Return the state with the best of many new members, before any iteration, for the worst ones."""
+        most = SCREENING_WORK // self._most_frames(state.elapsed)
+        parts = self._spread - self._searching
+        count = math.ceil(min(max(most, CANDIDATES), SCREENED) / parts)
+        better = math.ceil(CANDIDATES / parts)
         new = self.fit.spawned(state.travel.shape, state.spawned, count, delay)
         coarse = np.broadcast_to(SCREENING * _floor(noise), new.cost.shape)
-        new = self.fit.screened(new, self._in_use(state, elapsed), coarse, CANDIDATES)
-        return state._replace(spawned=state.spawned + count), new
-
-    def _tried(
-        self, state: CalibrationState, elapsed: float, noise: FloatArray
-    ) -> CalibrationState:
-        """Return the state after an iteration of a trial."""
-        frames = self._in_use(state, elapsed)
-        trial = self.fit.annealed(state.trial, frames, state.lateness, _floor(noise))
-        state = state._replace(trial=trial)
-        return branch(trial.iterations == TRIAL_ITERATIONS, self._joined, state)
-
-    def _joined(self, state: CalibrationState) -> CalibrationState:
-        """Return the state with the best of the old members and of those that were tried."""
-        every = self._together(state, state.trial.members)
-        return self._reduced(every, state.share.shape[-1])
+        new = self.fit.screened(new, self._in_use(state), coarse, better)
+        kept = self._reduced(state, state.share.shape[-1] - better)
+        return self._together(kept._replace(spawned=state.spawned + count), new)
 
     def _together(self, state: CalibrationState, new: Members) -> CalibrationState:
         """Return the state with new members beside the old ones."""
-        axis = state.travel.ndim
         nothing = np.zeros_like(new.cost)
-        pairs = zip(state.members, new, strict=True)
-        members = Members(*(np.concatenate(pair, axis=axis) for pair in pairs))
         share = np.concatenate([state.share, nothing], axis=-1)
         no_bias = np.zeros((*nothing.shape, self._m))
-        bias = np.concatenate([state.bias, no_bias], axis=axis)
-        return state._replace(members=members, share=share, bias=bias)
+        bias = np.concatenate([state.bias, no_bias], axis=state.travel.ndim)
+        return state._replace(members=state.members.beside(new), share=share, bias=bias)
 
     def _reduced(self, state: CalibrationState, size: int) -> CalibrationState:
         """Return the state with the best members alone, as many as `size`."""
-        finite = np.isfinite(state.members.cost)
-        cost = np.where(finite, state.members.cost, np.finfo(np.float64).max)
-        kept = np.argsort(cost, axis=-1)[..., :size]
+        kept = state.members.best(size)
         members, share, bias = _of(kept, state.members, state.share, state.bias)
         return state._replace(members=members, share=share, bias=bias)
 
@@ -568,7 +528,8 @@ class Calibration:
         """Return what is known at the last frames, with this one where it is due."""
         # Members become fewer at the same time in all lanes, whether a frame is due or not.
         same_size = bool(past) and past[-1].share.shape == state.share.shape
-        if same_size and not np.any(due):
+        fits = state.phase == self._fitting
+        if same_size and not np.any(due | fits):
             return past
         path = self._path(state.history, None)
         new = Known(
@@ -585,10 +546,11 @@ class Calibration:
             return (new,) * HORIZON
         if past[-1].share.shape != new.share.shape:
             past = tuple(_trimmed(each, new.share.shape[-1]) for each in past)
-        return tuple(
-            choose(due, later, earlier)
-            for later, earlier in zip((*past[1:], new), past, strict=True)
-        )
+        *earlier, newest = (choose(due, *each) for each in zip((*past[1:], new), past, strict=True))
+        # Members that are fitted to the frame a period later count as known at it.
+        fitted = newest._replace(members=new.members, share=new.share, bias=new.bias)
+        fitted = fitted._replace(fitted=new.fitted)
+        return (*earlier, choose(fits, fitted, newest))
 
     def jacobian(self, state: CalibrationState) -> FloatArray:
         """Return the Jacobian at the joint position of the last observation, (..., m, n)."""
@@ -649,10 +611,9 @@ def _of(
     kept: IntArray, members: Members, share: FloatArray, bias: FloatArray
 ) -> tuple[Members, FloatArray, FloatArray]:
     """Return the members of indices `kept` (..., k), with their weights, which sum to 1, and biases."""
-    fewer = Members(*(pick(each, kept, axes=1) for each in members))
     own = pick(share, kept, axes=1)
     total = np.maximum(np.add.reduce(own, axis=-1), MIN_TOTAL)
-    return fewer, own / total[..., None], pick(bias, kept, axes=1)
+    return members.picked(kept), own / total[..., None], pick(bias, kept, axes=1)
 
 
 def _trimmed(known: Known, size: int) -> Known:

@@ -10,6 +10,7 @@ from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.methods import METHODS
 from servobench.controllers.stages import calibration
+from servobench.controllers.stages.arm_fit import Fit
 from servobench.harness.apps.fmu.products import controller_model
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out
@@ -52,7 +53,6 @@ def test_zeros_that_are_all_unknown_are_found_by_new_members_and_never_without(m
     unknown = "moderate+joint_offsets=180deg"
     found = carry_out(run(unknown, 88706, task="tour")).steps
     assert found["jacobian_error"].iloc[-1] < 0.03
-    monkeypatch.setattr(calibration, "LAST_TRIAL", 0.0)
     monkeypatch.setattr(calibration, "SEARCH_TIME", 0.0)
     without = carry_out(run(unknown, 88706, task="tour")).steps
     assert without["jacobian_error"].iloc[-1] > 0.1
@@ -64,7 +64,6 @@ def test_the_search_explains_the_frames_of_unknown_zeros_much_sooner(monkeypatch
     runs = [run(unknown, seed, settings=brief, task="random") for seed in range(88700, 88708)]
     found = [carry_out(each).steps["diagnostic_calibration_rms"].iloc[-1] for each in runs]
     monkeypatch.setattr(calibration, "SEARCH_TIME", 0.0)
-    monkeypatch.setattr(calibration, "LAST_TRIAL", 0.0)
     without = [carry_out(each).steps["diagnostic_calibration_rms"].iloc[-1] for each in runs]
     assert np.median(found) < 0.5 * np.median(without)
 
@@ -75,6 +74,31 @@ def test_runs_side_by_side_have_equal_bits_while_some_of_them_try_new_members(pe
     unknown = "moderate+joint_offsets=180deg"
     runs = [run(unknown, seed, settings=brief, task="random") for seed in (88700, 88701, 88704)]
     assert_rows_of_single_runs(runs)
+
+
+@pytest.mark.parametrize(("period", "most"), [(0.05, 8), (0.008, 1)])
+def test_a_frames_iterations_are_spread_over_the_periods_to_the_next(monkeypatch, period, most):
+    made = []
+    update = calibration.Calibration.update
+    iterated = Fit.iterated
+
+    def updated(self, *arguments):
+        made.append(0)
+        return update(self, *arguments)
+
+    def counted(self, *arguments):
+        made[-1] += 1
+        return iterated(self, *arguments)
+
+    monkeypatch.setattr(calibration.Calibration, "update", updated)
+    monkeypatch.setattr(Fit, "iterated", counted)
+    brief = {"random": {"duration": 1.2}, "run": {"period": period}}
+    far = run("moderate+joint_offsets=180deg", 88701, settings=brief, task="random")
+    steps = carry_out(far).steps
+    assert max(made) == most
+    # Arms are searched for in most of the periods, and some are fitted.
+    assert sum(made) > 0.4 * most * len(made)
+    assert steps["diagnostic_calibration_rms"].iloc[-1] > 0.0
 
 
 @pytest.mark.parametrize("stamps", [{}, {"stamps": True, "jitter": 0.1}])

@@ -46,15 +46,15 @@ def searched(log: Log, model: RobotModel) -> list[dict[str, float]]:
     fit = Fit(ParametricModel(model), log.spec.feature.scale, log.spec.period)
     frames = _frames(fit, log)
     never_late = np.zeros(())
-    trial = fit.begun(_members(fit, model, frames), frames, np.array([FLOOR**2]))
-    middle = trial.variance
-    for _ in range(ITERATIONS):
+    members = fit.begun(_members(fit, model, frames), frames, np.array([FLOOR**2]))
+    middle = members.variance
+    for made in range(ITERATIONS):
         # What the best member leaves is taken for noise.
         floor = np.maximum(middle.min() / MEDIAN_SQUARE, FLOOR**2)
-        trial = fit.annealed(trial, frames, never_late, floor[None])
-        middle = np.median(squared(fit.residual(trial.members, frames)), axis=-1)
+        members = fit.annealed(members, np.array(made), frames, never_late, floor[None])
+        middle = np.median(squared(fit.residual(members, frames)), axis=-1)
     best = np.argsort(middle)[:RETURNED]
-    return [_values(fit, theta) for theta in trial.members.theta[best]]
+    return [_values(fit, theta) for theta in members.theta[best]]
 
 
 def _values(fit: Fit, theta: FloatArray) -> dict[str, float]:
