@@ -4,6 +4,7 @@
 
 #include <float.h>
 #include <math.h>
+#include <stdint.h>
 #include <string.h>
 
 enum { SWEEPS = 10 };        /* most sweeps of Jacobi rotations, which converge quadratically */
@@ -11,21 +12,64 @@ enum { SWEEPS = 10 };        /* most sweeps of Jacobi rotations, which converge 
 
 static inline double square(double x) { return x * x; }
 static inline double sign(double x) { return x == 0.0 ? 0.0 : x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x; }
-static inline double larger(double x, double y) { return x >= y || x != x ? x : y; }
-static inline double smaller(double x, double y) { return x <= y || x != x ? x : y; }
+/* Without branches, for several entries at a time */
+static inline double larger(double x, double y) { return (x >= y) | (x != x) ? x : y; }
+static inline double smaller(double x, double y) { return (x <= y) | (x != x) ? x : y; }
 static inline double modulo(double x, double y) { return x - y * floor(x / y); }
 
-/* result = terms for i from 0 to n − 1, in four partial sums, which do not wait for each other */
-#define SUM(result, i, n, term)                                       \
-    {                                                                 \
-        double part[4] = {0.0, 0.0, 0.0, 0.0};                        \
-        for (int first = 0; first + 4 <= (n); first += 4)             \
-            for (int lane = 0; lane < 4; lane++) {                    \
-                const int i = first + lane;                           \
-                part[lane] += (term);                                 \
-            }                                                         \
-        for (int i = (n) - (n) % 4; i < (n); i++) part[i % 4] += (term); \
-        result = (part[0] + part[2]) + (part[1] + part[3]);           \
+/* 2^n for a whole n, given as SHIFT + n: the last bits of such a sum are n. */
+#define SHIFT 6755399441055744.0 /* 1.5 · 2^52 */
+static inline double power_of_two(double shifted)
+{
+    const double one = 1.0;
+    int64_t bits, exponent;
+    double result;
+    memcpy(&bits, &one, sizeof bits);
+    memcpy(&exponent, &shifted, sizeof exponent);
+    bits += (int64_t)((uint64_t)exponent << 52);
+    memcpy(&result, &bits, sizeof result);
+    return result;
+}
+
+/* e^x within 2 units in the last place, for several entries at a time: 2^n e^r with |r| <= ln(2) / 2. */
+static inline double exponential(double x)
+{
+    const double above = x < -746.0 ? -746.0 : x;
+    const double given = above > 710.0 ? 710.0 : above;
+    const double n = (given * 1.4426950408889634 + SHIFT) - SHIFT;
+    /* ln(2) in two parts; the product of n and the first one is exact */
+    const double r = (given - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10;
+    double series = 1.0 / 6227020800.0;
+    series = series * r + 1.0 / 479001600.0;
+    series = series * r + 1.0 / 39916800.0;
+    series = series * r + 1.0 / 3628800.0;
+    series = series * r + 1.0 / 362880.0;
+    series = series * r + 1.0 / 40320.0;
+    series = series * r + 1.0 / 5040.0;
+    series = series * r + 1.0 / 720.0;
+    series = series * r + 1.0 / 120.0;
+    series = series * r + 1.0 / 24.0;
+    series = series * r + 1.0 / 6.0;
+    series = series * r + 0.5;
+    /* In two halves, as 2^n may be out of range where the result is not */
+    const double half = n * 0.5 + SHIFT;
+    const double other = n - (half - SHIFT) + SHIFT;
+    return (1.0 + (r + r * r * series)) * power_of_two(half) * power_of_two(other);
+}
+
+/* result = terms for i from 0 to n − 1, in partial sums, which do not wait for each other */
+#define SUM(result, i, n, term)                                           \
+    {                                                                     \
+        enum { PARTS = (n) < 64 ? 4 : 8 };                                \
+        double part[8] = {0.0};                                           \
+        for (int first = 0; first + PARTS <= (n); first += PARTS)         \
+            for (int lane = 0; lane < PARTS; lane++) {                    \
+                const int i = first + lane;                               \
+                part[lane] += (term);                                     \
+            }                                                             \
+        for (int i = (n) - (n) % PARTS; i < (n); i++) part[i % PARTS] += (term); \
+        for (int lane = 4; lane < PARTS; lane++) part[lane - 4] += part[lane]; \
+        result = (part[0] + part[2]) + (part[1] + part[3]);               \
     }
 
 /* Rows of a table that numbers name. */

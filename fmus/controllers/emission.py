@@ -291,9 +291,7 @@ class Writer:
             for array, table in value.entries:
                 same = np.array_equal(table, places)
                 if array == target.array and not same and np.isin(table, target.places).any():
-                    own = self.array(target.places.size)
-                    self.write(own, operand, shape)
-                    self.assign(target, Value("{}", [own]), shape)
+                    self.assign(target, Value("{}", [self.copied(operand)]), shape)
                     return
         for places, value, form in pieces:
             self.assign(Entries(target.array, places), value, form)

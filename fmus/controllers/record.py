@@ -258,15 +258,18 @@ def record(
         raise NotTraceable(
             "it holds something that is no formula, such as a solver; take another law"
         ) from error
+    given = sum(prod(shape) for shape, _ in inputs.values())
     try:
         with recording(modules):
             with block() as beginning:
-                tree = start(own, _inputs(inputs))
+                tree = start(own, _inputs(inputs, given))
                 first = leaves_of(tree)
                 _store("x", first)
             with block() as period:
                 x = source("x", sum(np.size(leaf) for leaf in first))
-                state, output = step(own, with_leaves(tree, _parts(x, first)), _inputs(inputs))
+                state, output = step(
+                    own, with_leaves(tree, _parts(x, first)), _inputs(inputs, given)
+                )
                 new = leaves_of(state)
                 _store("y", [output])
                 _store("x", new)
@@ -275,20 +278,14 @@ def record(
     if [np.shape(leaf) for leaf in new] != [np.shape(leaf) for leaf in first]:
         raise NotTraceable("its state has other sizes later than at the start")
     text = program({"controller_start": beginning, "controller_step": period})
-    given = sum(prod(shape) for shape, _ in inputs.values())
     return Recorded(text, x.size, given, np.size(output))
 
 
-def _inputs(inputs: Shapes) -> dict[str, Traced]:
+def _inputs(inputs: Shapes, size: int) -> dict[str, Traced]:
     """Return the inputs as arrays by name, which are parts of the column u."""
-    u = source("u", sum(prod(shape) for shape, _ in inputs.values()))
-    values = {}
-    first = 0
-    for name, (shape, kind) in inputs.items():
-        part = Traced(Buffer(u), first + np.arange(prod(shape)).reshape(shape))
-        values[name] = part.astype(DTYPES[kind])
-        first += prod(shape)
-    return values
+    parts = _parts(source("u", size), [np.empty(shape) for shape, _ in inputs.values()])
+    kinds = [DTYPES[kind] for _, kind in inputs.values()]
+    return dict(zip(inputs, map(Traced.astype, parts, kinds), strict=True))
 
 
 def _parts(x: Node, leaves: Sequence[Any]) -> list[Traced]:

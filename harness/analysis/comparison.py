@@ -305,7 +305,6 @@ SECOND_LAP = "rms_error_second_lap"
 POINT_TO_POINT = "point_to_point"
 CURVE = "curve"
 SEQUENCE = "sequence"
-TASK_KINDS = (POINT_TO_POINT, CURVE, SEQUENCE)
 
 
 def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:

@@ -378,27 +378,28 @@ def pack_result(result: RunResult) -> dict[str, Any]:
             "trace": result.trace}  # fmt: skip
 
 
-def pack_together(items: Sequence[Any]) -> dict[str, Any] | None:
-    """Return answers as one table of columns; None where columns differ, or a run has steps or a picture."""
+def pack_together(items: Sequence[Any]) -> dict[str, Any]:
+    """Return answers as one table of columns; empty where columns differ, or a run has steps or a picture."""
     rows = [item["row"] for item in items]
     if len(set(map(tuple, rows))) > 1 or any(item["steps"] or item["picture"] for item in items):
-        return None
+        return {}
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     return {"columns": columns, "traces": [item["trace"] for item in items]}
 
 
 def _unpacked(jobs: Sequence[Job], items: Sequence[Any]) -> Iterator[RunResult]:
-    """Yield the results of runs from the answers of a worker, one for each run or one table for all of them.
+    """Return the results of runs from the answers of a worker, one for each run or one table for all of them.
 
     Raises:
         ValueError: the next answer is not the result of its run.
     """
     match items:
         case [{"columns": dict(columns), "traces": list(traces)}]:
-            yield from _unpack_together(jobs, columns, traces)
-        case _:
-            for job, item in zip(jobs, items, strict=False):
-                yield unpack_result(job, item)
+            return _unpack_together(jobs, columns, traces)
+    # Runs with steps, and wrong ones, are read one by one.
+    with contextlib.suppress(Exception):
+        return iter(list(_unpack_together(jobs, **pack_together(items))))
+    return (unpack_result(job, item) for job, item in zip(jobs, items, strict=False))
 
 
 def _unpack_together(
@@ -406,13 +407,12 @@ def _unpack_together(
 ) -> Iterator[RunResult]:
     from servobench.harness.batch import consistency  # noqa: PLC0415 - as below
 
-    if not all(isinstance(each, str) for each in traces):
+    if not set(map(type, traces)) <= {str}:
         raise ValueError("its traces are no texts")
     _check_columns(jobs, columns)
     for job, trace, *values in zip(jobs, traces, *columns.values(), strict=True):
         row = dict(zip(columns, values, strict=True))
-        wrong = consistency.find_contradiction(row, None, job.run.run.period)
-        if wrong:
+        if wrong := consistency.find_contradiction(row, None, job.run.run.period):
             raise ValueError(wrong)
         yield RunResult(row, None, trace=trace)
 
@@ -575,8 +575,8 @@ def open_workers(
             ) from error
         return
     foreign = any(registry.is_foreign_plant(name, trusted=name in trusted) for name in plants)
-    foreign = foreign or any(map(registry.is_foreign_controller, controllers))
-    foreign = foreign or any(each.word == "metric" for each in own)
+    foreign |= any(map(registry.is_foreign_controller, controllers))
+    foreign |= any(each.word == "metric" for each in own)
     limits = bounds.limits(count, foreign=foreign and bounds.isolate and registry.can_travel(own))
     if count == 1 and limits == Limits():
         yield Workers()

@@ -61,29 +61,27 @@ def find_contradiction(row: Row, steps: pd.DataFrame | None, period: float) -> s
 def _find_within(row: Row, period: float) -> str:
     status = row["status"]
     outcome = row["outcome"]
+    settling = _number(row, "settling_time_s")
+    band = _number(row, "settling_band")
     if status != COMPLETED:
         fits = outcome == status
     elif row["task_kind"] == MOVE:
-        settled = not math.isnan(_number(row, "settling_time_s"))
-        fits = outcome in MOVE_OUTCOMES and settled == (outcome == SETTLED)
+        fits = outcome in MOVE_OUTCOMES and math.isnan(settling) == (outcome != SETTLED)
     elif row["task_kind"] == SEQUENCE:
         first = not math.isnan(_number(row, "settling_time_first_s"))
         fits = outcome in MOVE_OUTCOMES and (first or outcome != SETTLED)
     else:
-        band = FOLLOWING_BANDS * _number(row, "settling_band")
-        followed = _number(row, "rms_error_evaluated") <= band
+        followed = _number(row, "rms_error_evaluated") <= FOLLOWING_BANDS * band
         fits = outcome in CURVE_OUTCOMES and followed == (outcome == FOLLOWED)
     if not fits:
         return f"its outcome {outcome!r} contradicts its status, settling time or error"
     length = row["periods"] * period
-    settling = _number(row, "settling_time_s")
     if settling > length:
         return f"its settling time {settling:g} s is beyond its {length:g} s"
     largest = _number(row, "max_error")
     for name in ERRORS:
         if _number(row, name) > largest * (1.0 + TOLERANCE):
             return f"its {name} is larger than its largest error"
-    band = _number(row, "settling_band")
     if length - settling - period >= FINAL_SPAN and _number(row, "steady_state_error") > band * (
         1.0 + TOLERANCE
     ):

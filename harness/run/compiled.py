@@ -42,11 +42,12 @@ from servobench.plant.contract.signals import Observation, trusted_observation
 CPU_INFO = Path("/proc/cpuinfo")
 # Wide vectors, where the processor has them. No operation is fused or reordered, so that the bits are the same.
 WIDE = "avx2"
-FLAGS = ("-fvisibility=default",)
+# No library function sets `errno`, and nobody reads which operations were out of range.
+FLAGS = ("-fvisibility=default", "-fno-math-errno", "-fno-trapping-math")
 RECORDED = "recorded.json"  # file of a recorded step in the cache
 NOT_FINITE = ControllerDiverged, "the estimate or the command is not finite"
+# Kinds of faults and words for the codes of faults, other than those of `NOT_FINITE`
 CAUSES = {NOT_DEFINITE: (FilterDiverged, "a covariance is not positive definite")}
-"""Kinds of faults and words for the codes of faults, other than those of `NOT_FINITE`."""
 
 
 class NoForm(ValueError):
@@ -160,8 +161,8 @@ class CompiledServo(Servo):
         self.faults = errors
         spec = self.knowledge.spec
         velocity, jacobian = np.split(outputs, [spec.n], axis=-1)
-        new = CompiledState(x, jacobian.reshape(*codes.shape, spec.m, spec.n))
-        return Stepped(cast(Any, new), velocity)
+        new: Any = CompiledState(x, jacobian.reshape(*codes.shape, spec.m, spec.n))
+        return Stepped(new, velocity)
 
     def jacobian(self, state: Any) -> FloatArray:  # noqa: ANN401
         """See `Servo.jacobian`."""
@@ -195,13 +196,15 @@ def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
     """
     controller = experiment.controller
     request = run.request
-    plant = experiment.plant
-    kind = (request.controller, run.controller, request.robot, request.sensing, run.run, plant.spec)
+    spec = experiment.plant.spec
+    kind = (request.controller, run.controller, request.robot, request.sensing, run.run, spec)
     with np.printoptions(floatmode="unique"):
         words = repr(kind)
     key = (words, *_classes(controller))  # A notebook may define a class anew.
     if key not in _FOUND:
-        _FOUND[key] = "frames are stamped" if plant.stamps else _compile(run, experiment, words)
+        _FOUND[key] = (
+            "frames are stamped" if experiment.plant.stamps else _compile(run, experiment, words)
+        )
     found = _FOUND[key]
     if isinstance(found, str):
         remark(f"controller {request.controller!r} goes on in numpy: {found}")
@@ -212,7 +215,7 @@ def chosen(run: ResolvedRun, experiment: Experiment) -> Controller:
 def _compile(run: ResolvedRun, experiment: Experiment, kind: str) -> Recorded | str:
     """Return the compiled step of a controller, or why there is none."""
     try:
-        fast = replace(_recorded(run, experiment, kind), flags=(*FLAGS, *_processor_flags()))
+        fast = replace(_recorded(run, experiment, kind), flags=_flags())
         fast.prepare()
     except NoForm as error:
         return f"it cannot be compiled{error}"
@@ -249,16 +252,16 @@ def _package_digest() -> str:
     return key_of(*(digest(file) for file in files if file.suffix != ".pyc"))
 
 
-def _processor_flags() -> tuple[str, ...]:
+def _flags() -> tuple[str, ...]:
     with contextlib.suppress(OSError):
         if WIDE in CPU_INFO.read_text(encoding="utf-8").split():
-            return (f"-m{WIDE}",)
-    return ()
+            return (*FLAGS, f"-m{WIDE}")
+    return FLAGS
 
 
 def describe_compilation() -> str:
     """Return the compiler of this machine with the flags for controllers; "" without one."""
     with contextlib.suppress(ValueError):
         compiler = describe_compiler(this_platform())
-        return " ".join((compiler, *CODE, *FLAGS, *_processor_flags()))
+        return " ".join((compiler, *CODE, *_flags()))
     return ""

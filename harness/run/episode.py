@@ -27,7 +27,7 @@ from servobench.harness.run.own_metrics import OwnMetric, values_of
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, INSTANT, Ending, RunResult, ends_batch
-from servobench.harness.run.sampling import Drawn, draw
+from servobench.harness.run.sampling import Drawn, draw_once
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
@@ -83,8 +83,8 @@ def carry_out(
     pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
     row = _row(experiment.drawn, resolved, ending, _judge(logged, experiment), logged, pose)
     if steps or metrics:
-        table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian)
-        table = table.assign(**pose)
+        full = experiment.run.full_jacobian
+        table = logged.table(row["run_id"], full_jacobian=full).assign(**pose)
         values, fault = values_of(metrics, table, debug=debug)
         row |= {**values, "reason": row["reason"] or fault}
     if not steps:
@@ -112,7 +112,7 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
         Exception: they cannot be built together, because something is wrong with one of them; each has to be carried
             out by itself, and its row names the error.
     """
-    most = max(1, ROWS_AT_ONCE // runs[0].run.periods(draw(runs[0]).scenario.duration))
+    most = max(1, ROWS_AT_ONCE // runs[0].run.periods(draw_once(runs[0]).scenario.duration))
     parts = (runs[first : first + most] for first in range(0, len(runs), most))
     return [result for part in parts for result in _carry_out_part(part, keep)]
 

@@ -21,7 +21,7 @@ from servobench.harness.run.knowledge import network_source, nominal_knowledge
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolution import ResolvedRun
-from servobench.harness.run.sampling import Drawn, build_scenario, draw
+from servobench.harness.run.sampling import Drawn, build_scenario, draw, draw_once
 from servobench.harness.run.scenario import Scenario, TaskSetting
 from servobench.plant.bench.plant import Plant, PlantSetup, TrueModel
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -79,8 +79,7 @@ class Experiment:
         Returns:
             (..., periods + preview, m) [unit of the feature].
         """
-        count = self.periods if periods is None else periods
-        rows = count + self.run.preview_rows
+        rows = (periods or self.periods) + self.run.preview_rows
         period = self.plant.spec.period
         return self._in_lanes([each.scenario.reference.sampled(period, rows) for each in self.runs])
 
@@ -135,7 +134,7 @@ def build_together(runs: Sequence[ResolvedRun]) -> Experiment:
         Exception: any error of a run alone, or runs that cannot advance together.
     """
     first = runs[0]
-    drawn = tuple(map(draw, runs))
+    drawn = tuple(map(draw_once, runs))
     robots = stack([each.true for each in drawn])
     starts = np.array([each.scenario.start for each in drawn])
     plant, controller, networks = _assemble(first, robots, starts)

@@ -1,10 +1,12 @@
 """The sampling of a run: the true robot, its cameras and the task on it, drawn from a mismatch and a seed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from servobench.harness.config.registry import is_foreign_plant
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.plausibility import check_extents, check_times
@@ -21,6 +23,7 @@ from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.mismatch import MismatchSample, sample_mismatch
 
 POINTS = 12  # points of a curve that are checked
+ROBOTS_KEPT = 1024  # true robots with their tasks, a few kilobytes each
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,21 @@ def draw(resolved: ResolvedRun) -> Drawn:
         nominal=find_sensing(request.sensing).nominal(robot),
     )
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
+
+
+_kept = lru_cache(ROBOTS_KEPT)(draw)
+
+
+def draw_once(resolved: ResolvedRun) -> Drawn:
+    """Return what `draw` does; methods that meet the same robot one after the other share it.
+
+    What depends on code or files of a user's is drawn anew.
+    """
+    request = resolved.request
+    foreign = is_foreign_plant(request.plant) or request.task not in TASKS
+    if foreign or request.mismatch.calibration or "." in request.robot + request.sensing:
+        return draw(resolved)
+    return _kept(replace(resolved, request=replace(request, controller=""), controller=None))
 
 
 @configuration_errors()

@@ -147,11 +147,6 @@ class Extents(NamedTuple):
     outlier_size: float  # distance of an outlier
 
 
-def without_disturbance(sensing: SensingConfig) -> SensingConfig:
-    """Return the settings of a sensor with the same latency and frame period that is right in every frame."""
-    return SensingConfig(0.0, sensing.latency, frame_period=sensing.frame_period)
-
-
 LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 EXTENTS = {**LENGTH, "px": math.nan}
 SHARE = {"%": 1e-2, "": 1.0}

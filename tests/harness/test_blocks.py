@@ -578,6 +578,19 @@ def test_rows_are_the_same_after_their_way_as_columns(real):
     assert [list(each.row) for each in back] == [list(real.row)] * 2
 
 
+@pytest.mark.parametrize("change", [{}, {"status": 3}])
+def test_answers_of_runs_are_read_at_once_and_one_by_one_where_one_is_wrong(change, monkeypatch):
+    read = []
+    monkeypatch.setattr(blocks, "unpack_result", lambda job, item: read.append(job))
+    items = [told(row=row) for row in rows_of({}, change)]
+    jobs = [job(0, None), job(1, None)]
+    found = list(blocks._unpacked(jobs, items))
+    assert read == (jobs if change else [])
+    assert [each and each.row for each in found] == [
+        None if change else each["row"] for each in items
+    ]
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [

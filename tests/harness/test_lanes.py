@@ -1,3 +1,6 @@
+from functools import lru_cache
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,12 +11,14 @@ from kit.plants import NEEDS_BULLET
 from servobench.controllers.laws.mfac import MfacLaw
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.settings import Settings
+from servobench.harness.run import sampling
 from servobench.harness.run.episode import carry_out_together
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import FilterDiverged
 
+CALIBRATION = Path(__file__).parents[2] / "plant/data/ur5_factory_calibration.yaml"
 ROUGH = {
     "kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}},
     "random": {"duration": 2.5},
@@ -54,6 +59,29 @@ def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     np.testing.assert_equal(
         rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]]
     )
+
+
+def test_methods_share_the_robots_they_meet_but_those_of_files_are_drawn_anew(monkeypatch):
+    drawn = []
+    draw = sampling.draw
+
+    def counted(resolved):
+        drawn.append(resolved.request.seed)
+        return draw(resolved)
+
+    monkeypatch.setattr(sampling, "draw", counted)
+    monkeypatch.setattr(sampling, "_kept", lru_cache(8)(counted))
+    short = {"random": {"duration": 0.1}}
+    first = rows(carry_out_together(runs("rls", short)))
+    assert drawn == list(SEEDS)
+    carry_out_together(runs("constant", short))
+    assert drawn == list(SEEDS)
+    np.testing.assert_equal(rows(carry_out_together(runs("rls", short))), first)
+    carry_out_together(runs("rls", {**short, "run": {"period": 0.02}}))
+    assert drawn == [*SEEDS, *SEEDS]
+    sampling.draw_once(runs("rls", short, mismatch=f"factory={CALIBRATION}")[0])
+    sampling.draw_once(runs("rls", short, mismatch=f"factory={CALIBRATION}")[0])
+    assert drawn == [*SEEDS, *SEEDS, SEEDS[0], SEEDS[0]]
 
 
 def test_runs_with_a_disturbed_sensor_go_side_by_side_but_not_with_others():

@@ -11,7 +11,7 @@ import numpy as np
 from servobench.harness.apps.loops.equilibrium import Warm, at_rest, frozen
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.sensing import without_disturbance
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import build_kinematic
 
@@ -79,8 +79,8 @@ class SmallLoop:
         """Return the true feature in each period, (periods, m), with the desired one moved by an offset [m]."""
         rest = self._rest
         late = self.latency if latency is None else latency
-        quiet = without_disturbance(self._warm.plant.sensing)
-        sensing = replace(quiet, latency=round(late, TIME_DIGITS))
+        frames = self._warm.plant.sensing.frame_period
+        sensing = SensingConfig(0.0, round(late, TIME_DIGITS), frame_period=frames)
         setup = PlantSetup(self._warm.model, rest.joint_position, self._period)
         plant = build_kinematic(replace(self._warm.plant, sensing=sensing), setup)
         reference = rest.reference(rest.feature + offset)

@@ -11,7 +11,7 @@ from scipy import stats
 from kit.plants import configure, mismatched, setup
 from servobench.plant.bench.sensor import Spell, begin_probability
 from servobench.plant.contract import sensing as families
-from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, without_disturbance
+from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.mismatch import Mismatch
@@ -189,11 +189,6 @@ def test_a_window_that_is_none_is_refused(windows):
         ValueError, match=r"^occlusion_windows must be pairs of a begin above 0.*got \[[0-9, ]+\]$"
     ):
         SensingConfig(occlusion_windows=windows)
-
-
-def test_a_sensor_without_disturbance_keeps_its_times_only():
-    rough = SensingConfig(0.1, 0.2, 0.3, 4.0, 0.05, 0.1, "stable", outliers=0.1, occlusions=0.1)
-    assert without_disturbance(rough) == SensingConfig(0.0, 0.2, frame_period=0.05)
 
 
 @pytest.mark.parametrize("axis", SENSOR_AXES)

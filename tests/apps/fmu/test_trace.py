@@ -36,6 +36,16 @@ def traced(function, *arrays):
     return computed
 
 
+def test_the_exponential_is_that_of_numpy_to_two_units_in_the_last_place():
+    limits = [0.0, -0.0, 709.7, 709.8, -708.0, -745.0, -746.0, 1e300, -1e300, np.inf, -np.inf]
+    x = np.concatenate([GENERATOR.uniform(-60.0, 60.0, 4096), GENERATOR.normal(size=4096), limits])
+    found, _ = traced(np.exp, x)(x)
+    with np.errstate(over="ignore", under="ignore"):
+        wanted = np.exp(x)
+    np.testing.assert_array_max_ulp(found, wanted, 2)
+    assert np.isnan(traced(np.exp, np.zeros(1))([np.nan])[0]).all()
+
+
 def view_written(a):
     new = a.copy()
     rows = new[1:]
