@@ -284,7 +284,6 @@ def _carry_out(
     question: Question | None = None,
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
-    from servobench.harness.analysis.decisions import decide_worlds
     from servobench.harness.analysis.folder import (
         mark_tuned,
         titled_runs,
@@ -293,7 +292,6 @@ def _carry_out(
     from servobench.harness.analysis.verdict import judge as find_verdict
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.batch.results import ResultsFolder
-    from servobench.harness.cli.deciding import print_answers, save_decisions
     from servobench.harness.cli.progress import watching
     from servobench.harness.config.installation import missing_extra
 
@@ -307,6 +305,9 @@ def _carry_out(
         say_methods(opened.manifest)
         print_faults(opened, runs)
         if question is not None:
+            from servobench.harness.analysis.decisions import decide_worlds
+            from servobench.harness.cli.deciding import print_answers, save_decisions
+
             answers = decide_worlds(runs, question)
             save_decisions(opened, answers)
         if out is None:

@@ -305,9 +305,8 @@ def neighbours(file: Path, root: Path) -> list[Path]:
         file: the file.
         root: the folder from which its imports start.
     """
-    return sorted(
-        {path for _, _, name in traced_imports(file, root) for path in _files(root, name)} - {file}
-    )
+    names = {name for _, _, name in traced_imports(file, root)}
+    return sorted({path for name in names for path in _files(root, name)} - {file})
 
 
 def code_digest(file: Path) -> str:

@@ -11,6 +11,7 @@ import pytest
 from kit.folders import comparison
 from servobench.harness.analysis.comparison import compare_pairs, margin
 from servobench.harness.analysis.tables import Selection, judge_places
+from servobench.harness.apps.figures import figures
 from servobench.harness.batch import trials
 from servobench.harness.batch.measuring import add_metric
 from servobench.harness.batch.results import ResultsFolder, load_runs, load_steps
@@ -117,8 +118,13 @@ def itae_of(steps):
 
 @pytest.mark.slow
 def test_a_metric_is_computed_with_the_runs_and_shown_wherever_metrics_are(
-    files, output_of, tmp_path
+    files, output_of, monkeypatch, tmp_path
 ):
+    plans = figures._plans
+    # Other figures take most of the time and show no metric of users
+    monkeypatch.setattr(
+        figures, "_plans", lambda *words: (each for each in plans(*words) if each.kind == "own")
+    )
     words = ("constant,ukf_mfac", "--seeds", "2", "--metric", "./mine.py:itae", "--out", "out")
     said = output_of("compare", *SHORT, *words)
     assert "itae [m·s²]" in said

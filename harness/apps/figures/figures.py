@@ -172,6 +172,9 @@ def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> Nam
             letters = round(LETTERS * figure.get_figwidth())
             wrapped = [textwrap.fill(heading, letters), textwrap.fill(details, letters)]
             figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
+    for axes in figure.axes:
+        # To lay a panel out, each spine computes the ticks again; labels reach beyond all but those at the bottom
+        axes.spines[["left", "right", "top"]].set_in_layout(False)
     words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
     return NamedFigure(
         kind=plan.kind,

@@ -247,8 +247,7 @@ def draw_jacobian(axes: Axes, ensembles: Ensembles, styles: Styles) -> None:
     for name in exact:
         axes.plot([], [], label=f"{name} (exact)", **styles[name].line_arguments(1))
     axes.set_ylabel("Jacobian error [%]")
-    drawn = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.get_lines()]
-    if any((values > 0.0).any() for values in drawn):
+    if math.isfinite(axes.dataLim.minposy):  # infinite where no value is above zero
         plain_logarithms(axes)
     else:
         write_inside(axes, "no values")

@@ -13,7 +13,7 @@ from kit.nightly import some
 from kit.own import write
 from servobench import run
 from servobench.harness.apps.studies.challenge import find_challenge
-from servobench.harness.apps.twin import preflight
+from servobench.harness.apps.twin import preflight, search
 from servobench.harness.apps.twin.drive import (
     Response,
     command_mistake,
@@ -59,6 +59,13 @@ def few_fits(monkeypatch):
     """Let mistakes be found by fewer fits to fewer frames, each of which takes a fifth of a second."""
     monkeypatch.setattr(preflight, "SCREENED", 3)
     monkeypatch.setattr(preflight, "FRAMES", 75)
+
+
+@pytest.fixture
+def few_arms(monkeypatch):
+    """Let arms far from the nominal one be searched among fewer and fitted less, for seconds in place of a minute."""
+    monkeypatch.setattr(search, "DRAWS", 512)
+    monkeypatch.setattr(search, "ITERATIONS", 25)
 
 
 @cache
@@ -393,6 +400,7 @@ MISTAKES = {
 BY_DAY = [name for name in MISTAKES if name != "negated"]  # a remedy, as that of exchanged joints
 
 
+@pytest.mark.usefixtures("few_arms")
 @pytest.mark.parametrize("mistake", some(MISTAKES, *BY_DAY))
 def test_a_mistake_is_named_with_its_remedy(mistake):
     change, wanted = MISTAKES[mistake]
@@ -632,6 +640,7 @@ def test_a_twin_has_the_rate_and_latency_of_a_camera_at_no_multiple_of_the_perio
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_arms")
 def test_two_mistakes_are_named_together_and_a_log_they_do_not_explain_is_refused(monkeypatch):
     log, _, model = logged()
     order = np.argsort(np.argsort(log.spec.joint_names))
@@ -650,6 +659,7 @@ def test_two_mistakes_are_named_together_and_a_log_they_do_not_explain_is_refuse
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_arms")
 def test_a_mistake_is_named_although_the_camera_was_moved_too():
     log, _, model = logged()
     moved = log.features + 0.05 * (log.time[:, None] > 0.5 * log.time[-1]) * (1, 0, 0)
@@ -697,9 +707,12 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sensing", "seed"), [("position", 88702), ("pixel", 88709)])
-def test_an_arm_far_from_the_nominal_one_is_found_by_the_search(sensing, seed):
-    settings = {"random": {"duration": 60.0}, "Excite": {"swing": 0.25}}
+@pytest.mark.usefixtures("few_arms")
+@pytest.mark.parametrize(
+    ("sensing", "seed", "duration"), [("position", 88702, 60.0), ("pixel", 88709, 40.0)]
+)
+def test_an_arm_far_from_the_nominal_one_is_found_by_the_search(sensing, seed, duration):
+    settings = {"random": {"duration": duration}, "Excite": {"swing": 0.25}}
     words = find_challenge("unknown_arm").mismatch
     made = run(
         "docs/examples/excite.py",
