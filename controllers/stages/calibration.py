@@ -157,11 +157,10 @@ class Calibration:
         self._n = knowledge.spec.n
         self.fit = Fit(model, knowledge.unit, self._period)
         self._periods = 1 + (self.fit.rows - 1) * self.fit.stride
-        self._spread = max(
-            1, whole_periods(MOTION_TIME, self._period)
-        )  # periods from frame to frame
+        # At least so many periods lie between frames that are learned from.
+        self._spread = max(1, whole_periods(MOTION_TIME, self._period))
         self._frame_time = self._spread * self._period
-        # Phases in which members are fitted and arms are searched for
+        # Periods after a frame in which members are fitted and arms are searched for
         self._fitting = min(1, self._spread - 1)
         self._searching = min(2, self._spread - 1)
 
@@ -298,8 +297,10 @@ class Calibration:
         level = np.where(many & state.fitted, least, noise)
 
         for _ in range(math.ceil(ANNEALED / self._spread)):
-            begins = (state.begun > 0) | ((state.begun == 0) & (phase >= self._fitting))
-            state = branch(begins & ~state.fitted, self._annealed, state, level)
+            # Placing the cameras is work enough for a period of several.
+            waits = (state.begun == 0) & (phase < self._fitting)
+            begins = (state.begun >= 0) & ~state.fitted & ~waits
+            state = branch(begins, self._annealed, state, level)
         unexplained = self._unexplained(state)
         searches = unexplained & (phase >= self._searching)
         state = branch(searches & (phase < self._spread), self._refreshed, state, delay, level)
