@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kit.command import servobench
+from kit.command import finish, servobench, start
 from servobench.harness.apps.board.selftest import METHODS, read_reference
 from servobench.harness.apps.board.selftest import compare as held_against
 from servobench.harness.batch.api import compare
@@ -48,6 +48,14 @@ def test_the_self_test_names_each_part_and_says_whether_all_are_the_same(monkeyp
     printed = capsys.readouterr().out
     assert all(f"\n{name} " in printed for name in ("libm", "blas", "kinematic", *METHODS))
     assert code == int("bit for bit as the reference did" not in printed)
+
+
+def test_the_reference_is_of_this_code_wherever_the_machine_is_that_of_the_reference():
+    process = start("selftest")
+    _, printed = finish(process)
+    here, reference = (line.partition(": ")[2] for line in printed.splitlines()[:2])
+    # Elsewhere a difference may be the machine's
+    assert here != reference or process.returncode == 0, "run benchmarks/reference.py"
 
 
 def test_a_plant_without_stored_numbers_is_refused_in_one_line(monkeypatch, capsys):
