@@ -165,11 +165,9 @@ def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatA
     weights = np.stack([position, slope / grid], axis=-2)
     rows = np.moveaxis(path, -2, delay.ndim - 1)
     support = pick(rows, np.clip(first[..., None] + SUPPORT, 0, last), axes=2)
-    frames = support.shape[-2:]
     found = weights @ support.reshape(*support.shape[:-2], -1)
-    return found[..., 0, :].reshape(*delay.shape, *frames), found[..., 1, :].reshape(
-        *delay.shape, *frames
-    )
+    both = found.reshape(*found.shape[:-1], *support.shape[-2:])
+    return both[..., 0, :, :], both[..., 1, :, :]
 
 
 def each_row(frames: Frames, function: Callable[[FloatArray], FloatArray]) -> Frames:

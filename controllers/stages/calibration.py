@@ -78,8 +78,8 @@ FAST = 0.03  # [1/s] least speed of a feature whose residuals tell lateness
 MOVE_ERROR = 3.0  # [1] error of a frame in σ from which on it tells a moved camera
 MIN_EXPONENT = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL = 1e-12  # [1] sum of weights by which they are divided
-CANDIDATES = 8  # new members that are tried at once
-SCREENED = 256  # new members at most of which these are the best, before any iteration
+CANDIDATES = 8  # new members from frame to frame
+SCREENED = 256  # arms at most of which these are the best, before any iteration
 SCREENING_WORK = 4096  # product of them and frames that is not exceeded
 SCREENING = 25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
 
