@@ -16,6 +16,7 @@ during the first one, members are fitted to it in the next one, and other arms a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple, final
 
 import numpy as np
@@ -79,6 +80,7 @@ MOVE_ERROR = 3.0  # [1] error of a frame in σ from which on it tells a moved ca
 MIN_EXPONENT = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL = 1e-12  # [1] sum of weights by which they are divided
 CANDIDATES = 8  # new members from frame to frame
+LONG_SPREAD = 4  # periods of a frame up to which a period is long enough for both
 SCREENED = 256  # arms at most of which these are the best, before any iteration
 SCREENING_WORK = 4096  # product of them and frames that is not exceeded
 SCREENING = 25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
@@ -163,6 +165,8 @@ class Calibration:
         # Periods after a frame in which members are fitted and arms are searched for
         self._fitting = min(1, self._spread - 1)
         self._searching = min(2, self._spread - 1)
+        # Short periods are either for new arms or for an iteration.
+        self._cycle = 2 if self._spread > LONG_SPREAD else 1
 
     def start(self, observation: Observation) -> CalibrationState:
         """Return the state before any frame."""
@@ -249,12 +253,6 @@ class Calibration:
         """Return the largest number of frames that there can be, which does not depend on other lanes."""
         return 1 + round(elapsed / self._frame_time)
 
-    def _unexplained(self, state: CalibrationState) -> BoolArray:
-        """Return whether members are still searched for an arm that explains the frames, (...)."""
-        if state.elapsed > SEARCH_TIME:
-            return np.zeros_like(state.fitted)
-        return np.asarray(state.fitted & (state.rms > EXPLAINED * state.noise))
-
     def _taken_in(
         self,
         state: CalibrationState,
@@ -286,7 +284,8 @@ class Calibration:
             frames = state.frames
         moved = norm(y - frames.feature[..., 0, :]) > MIN_MOTION * noise
         begins = (state.begun < 0) & moved & (frames.number > 2)
-        return branch(begins, self._begun, state._replace(passed=state.passed + 1), delay)
+        state = state._replace(passed=state.passed + 1)
+        return _by_size(begins, self._begun, state, delay)
 
     def _worked(self, state: CalibrationState, delay: FloatArray) -> CalibrationState:
         """Return the state after the work of a period: a part of what the last frame asks for."""
@@ -300,17 +299,20 @@ class Calibration:
             # Placing the cameras is work enough for a period of several.
             waits = (state.begun == 0) & (phase < self._fitting)
             begins = (state.begun >= 0) & ~state.fitted & ~waits
-            state = branch(begins, self._annealed, state, level)
-        unexplained = self._unexplained(state)
-        searches = unexplained & (phase >= self._searching)
-        state = branch(searches & (phase < self._spread), self._refreshed, state, delay, level)
+            state = _by_size(begins, self._annealed, state, level)
+        unexplained = state.fitted & (state.rms > EXPLAINED * noise)
+        searches = unexplained & (state.elapsed <= SEARCH_TIME) & (phase >= self._searching)
+        turn = (phase - self._searching) % self._cycle
+        refreshes = searches & (phase < self._spread) & (turn == 0)
+        state = branch(refreshes, self._refreshed, state, delay, level)
+        searches = searches & (turn == self._cycle - 1)
         for _ in range(max(1, (SEARCH_ITERATIONS - 1) // self._spread)):
             state = branch(searches, self._searched, state, level)
 
         explained = many & (state.rms < EXPLAINED * noise)
         fits = phase == self._fitting
         iterates = state.fitted & (~explained | (state.passed >= ITERATION_INTERVAL))
-        state = branch(fits & iterates, self._continued, state, level)
+        state = _by_size(fits & iterates, self._continued, state, level)
         used = np.where(fits, self._trusted(state), state.used & state.fitted)
         return state._replace(used=used)
 
@@ -345,8 +347,9 @@ class Calibration:
         return rows_ago(history, ago)[..., ::-1, :]
 
     def _in_use(self, state: CalibrationState) -> Frames:
-        """Return the frames, without rows for which there were too few periods so far."""
-        return first(state.frames, self._most_frames(state.elapsed))
+        """Return the frames, without rows that are empty in all lanes of a size (`_by_size`)."""
+        most = np.max(np.where(state.frames.number > KEPT, FRAMES, KEPT))
+        return first(state.frames, min(most, self._most_frames(state.elapsed)))
 
     def _begun(self, state: CalibrationState, delay: FloatArray) -> CalibrationState:
         """Return the state in which members begin for the first time, or anew after a move of the camera."""
@@ -496,7 +499,7 @@ class Calibration:
     ) -> CalibrationState:
         """Return the state with the best of many new members, before any iteration, for the worst ones."""
         most = SCREENING_WORK // self._most_frames(state.elapsed)
-        parts = self._spread - self._searching
+        parts = math.ceil((self._spread - self._searching) / self._cycle)
         count = math.ceil(min(max(most, CANDIDATES), SCREENED) / parts)
         better = math.ceil(CANDIDATES / parts)
         new = self.fit.spawned(state.travel.shape, state.spawned, count, delay)
@@ -573,12 +576,9 @@ class Calibration:
         drift = by_turn * (members.turning * self._period)[..., None]
         by_joint = found.by_joint * q.slope[..., None, :]
         jacobian = by_joint[..., 0, :, :] / fit.scale
-        flat = jacobian.reshape(*jacobian.shape[:-2], -1)
-        mean = np.vecmat(state.share, flat)
-        shape = (*bound.shape[:-1], *jacobian.shape[-2:])
         return Ahead(
             feature=np.vecmat(state.share, feature + state.bias),
-            jacobian=mean.reshape(shape),
+            jacobian=np.vecmat(state.share[..., None, :], np.moveaxis(jacobian, -3, -2)),
             drift=np.vecmat(state.share, drift),
         )
 
@@ -600,6 +600,18 @@ class Calibration:
             "regression_error": errors[..., 0],
             "arm_error": errors[..., 1],
         }
+
+
+def _by_size(
+    chosen: BoolArray,
+    function: Callable[..., CalibrationState],
+    state: CalibrationState,
+    *arguments: FloatArray,
+) -> CalibrationState:
+    """Return the result of `branch`, in which lanes that keep many frames do not meet those that do not."""
+    many = state.frames.number > KEPT
+    state = branch(chosen & ~many, function, state, *arguments)
+    return branch(chosen & many, function, state, *arguments)
 
 
 def _floor(noise: FloatArray) -> FloatArray:
@@ -628,8 +640,6 @@ def _median_of(values: FloatArray, chosen: BoolArray) -> FloatArray:
     """Return the median of the chosen values, (...), of (..., k); 0 where none is chosen."""
     count = np.add.reduce(chosen, axis=-1)
     ordered = np.sort(np.where(chosen, values, np.inf), axis=-1)
-    low = pick(ordered, np.maximum((count - 1) // 2, 0))
-    last = values.shape[-1] - 1
-    high = pick(ordered, np.minimum(count // 2, last))
-    high = np.where(np.isfinite(high), high, low)
+    low = pick(ordered, np.maximum(count - 1, 0) // 2)
+    high = pick(ordered, count // 2)
     return np.where(count > 0, 0.5 * (low + high), 0.0)

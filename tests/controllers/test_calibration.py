@@ -111,6 +111,13 @@ def test_runs_side_by_side_have_the_bits_of_each_run_alone(stamps):
     assert_rows_of_single_runs(runs)
 
 
+def test_runs_of_which_some_keep_more_frames_have_the_bits_of_each_run_alone():
+    late = {"kinematic": {"sensing": {"jitter": 0.08}}, "circle": {"laps": 1}}
+    # The frames of the first one seem to come late, those of the other one do not.
+    runs = [run("moderate", seed, settings=late) for seed in (88700, 88701)]
+    assert_rows_of_single_runs(runs)
+
+
 def test_with_stamps_the_latency_of_frames_is_found_though_it_swings():
     swing = {"latency": 0.05, "latency_swing": 0.1, "swing_period": 1.0}
     found = []
