@@ -293,13 +293,13 @@ CHALLENGES = Study(
 )
 LEARNED = Study(
     "learned",
-    "what a method reaches by what it knows or learns: 200 robots in eight worlds, 50 with references",
+    "what a method reaches by what it knows or learns: 200 robots in eight worlds",
     35,
     {
         "runs": suite(
             (*LEARNED_BY, *(name for name in RENDERED if name.endswith(SUFFIX))),
             LEARNED_SEEDS,
-            "50",
+            "200",
             "--challenges",
             ",".join(LEARNED_IN),
         )
