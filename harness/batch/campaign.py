@@ -142,14 +142,20 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         )
     own = offered([*runs.sections, *campaign.metrics])
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
-    names = {"plants": runs.plants, "controllers": runs.controllers}
     trusted = [
         name
         for name, section in campaign.settings.sections.items()
         if section.get("isolate") is False
     ]
     opening = open_workers(
-        how.workers, how.scheduler, bounds, **names, own=own, trusted=trusted, steps=campaign.steps
+        how.workers,
+        how.scheduler,
+        bounds,
+        plants=runs.plants,
+        controllers=runs.controllers,
+        own=own,
+        trusted=trusted,
+        steps=campaign.steps,
     )
     with opening as place:
         _carry_out_at(place, campaign, runs, own, folder, how)
@@ -272,7 +278,7 @@ def _jobs(
     for index in indices:
         cell = campaign.cells[index]
         if run is not None and share_settings(run.request, cell.request):
-            run = replace(run, request=cell.request)
+            run = ResolvedRun(cell.request, run.run, run.plant, run.controller, run.task)
         else:
             run = select(cell.request, sections)
             key = side_by_side_key(run) if together else None

@@ -63,8 +63,8 @@ class Batch:
         is_default = self.mismatches == (DEFAULT_MISMATCH,)
         own = {plant for plant in plants if is_default and find_plant(plant).own_robot}
 
-        def run(
-            sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
+        def first_run(
+            sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str
         ) -> RunRequest:
             if plant in own:
                 remark(
@@ -72,11 +72,12 @@ class Batch:
                 )
                 mismatch = Mismatch()
             return RunRequest(
-                plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing
+                plant, controller, task, mismatch, seeds[0], robot=self.robot, sensing=sensing
             )
 
         mismatches = [Mismatch.parse(text) for text in self.mismatches]
-        return Grid(run, self.sensings, plants, self.tasks, mismatches, self.controllers, seeds)
+        runs = Grid(first_run, self.sensings, plants, self.tasks, mismatches, self.controllers)
+        return Grid(RunRequest.with_seed, runs, seeds)
 
 
 def parse_seeds(text: str) -> Sequence[int]:

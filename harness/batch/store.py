@@ -77,7 +77,9 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     if failures:
         files[part_name(index, FAILURES)] = _text(failures)
     rows = tables.as_table([result.row for result in outcome])
-    files[part_name(index, RUNS)] = partial(tables.write_table, rows, batch=f"{campaign}@{index}")
+    files[part_name(index, RUNS)] = partial(
+        tables.write_table, rows, batch=f"{campaign}@{index}", compression="none"
+    )
     with writing(folder):
         for result in outcome:
             if result.picture is not None:

@@ -87,31 +87,30 @@ def as_table(rows: Sequence[Row]) -> pa.Table:
 
     def column(name: str, values: Sequence[Any]) -> pa.Array:
         made = pa.array(values, from_pandas=True)
-        numbers = name in NUMBERS or float in map(type, values)
-        if pa.types.is_null(made.type) and numbers:
-            return made.cast(pa.float64())
+        if pa.types.is_null(made.type) and (name in NUMBERS or float in map(type, values)):
+            return pa.nulls(len(values), pa.float64())
         return made
 
-    empty = dict.fromkeys(chain.from_iterable(rows))
-    columns = zip(*((empty | dict(row)).values() for row in rows), strict=True)
-    return pa.table(dict(zip(empty, map(column, empty, columns), strict=True)))
+    names = dict.fromkeys(chain.from_iterable(rows))
+    return pa.table({name: column(name, [row.get(name) for row in rows]) for name in names})
 
 
-def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
+def write_table(table: pa.Table, path: Path, batch: str = "", compression: str = "snappy") -> None:
     """Write a table.
 
     Args:
         table: without metadata.
         path: of the file.
         batch: whose rows these are.
+        compression: "none" for a short-lived file, which takes less time and more space.
     """
     schema = table.schema.with_metadata({BATCH: batch} if batch else None)
     with (
         path.open("wb") as file,
-        pq.ParquetWriter(file, schema, write_page_checksum=True) as writer,
+        pq.ParquetWriter(file, schema, compression=compression, write_page_checksum=True) as writer,
     ):
         if len(table):
-            writer.write_table(table.cast(schema))
+            writer.write_table(table.replace_schema_metadata(schema.metadata))
 
 
 def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
@@ -295,22 +294,6 @@ def lacking(kind: str, schema: pa.Schema) -> str:
             wanted = "texts" if text else "whole numbers" if name in WHOLE else "numbers"
             return f"has {given} in the column {name}, where {wanted} belong"
     return ""
-
-
-@lru_cache(8)  # the rows of a batch have the same ones
-def unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, type, str]]:
-    """Return the columns with a value of a wrong type, each with this type and the name of the right one.
-
-    Args:
-        kinds: name, type of a value and type of the known value of each column.
-    """
-    unfit = []
-    for name, kind, known in kinds:
-        usual = str if name in TEXTS else float
-        wanted = (usual, type(None)) if known is type(None) else (known,)
-        if not issubclass(kind, wanted):
-            unfit.append((name, kind, wanted[0].__name__))
-    return unfit
 
 
 def steps_of_run(records: npt.NDArray[Any], run_id: str) -> pd.DataFrame:

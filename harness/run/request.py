@@ -6,8 +6,9 @@ import operator
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from annotated_types import Ge
 
@@ -143,15 +144,27 @@ class RunRequest:
         """Return whether this run varies the setting of a key such as `kinematic.lag`."""
         return bool(self.varied) and self._by_role(key) in dict(self.varied)
 
+    def with_seed(self, seed: int) -> Self:
+        """Return the same run with another seed."""
+        other = object.__new__(type(self))
+        kept = {"_stem": self._stem, "_row": self._row}
+        vars(other).update(vars(self), **kept, seed=read_seed(seed))
+        return other
+
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
+        return f"{self._stem}-{self.seed}"
+
+    @cached_property
+    def _stem(self) -> str:
+        """The name without the seed, which is kept: most runs of a batch have that of another one."""
         robot = ""
         if self.robot != DEFAULT_ROBOT:
             robot = f"{short_name(self.robot).replace(WITH, '+')}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{Path(self.sensing).name}-"
         varied = "".join(map(words_in_name, self.varied))
-        name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}-{self.seed}"
+        name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}"
         return UNFIT_FOR_FILES.sub("_", name)
 
     def as_row(self) -> dict[str, Any]:
@@ -159,6 +172,11 @@ class RunRequest:
 
         A varied setting is a column: that of its short name, or its key.
         """
+        return {**self._row, "run_id": self.run_id, "seed": self.seed}
+
+    @cached_property
+    def _row(self) -> dict[str, Any]:
+        """The columns of this run or of one with another seed."""
         varied = dict(self.varied)
         short = {each.column: varied.pop(each.key, each.usual) for each in SHORT_NAMES.values()}
         others = {}

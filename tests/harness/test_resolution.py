@@ -44,6 +44,18 @@ def test_a_resolved_run_can_be_sent_to_another_process(controller):
     assert repr(again.controller) == repr(run.controller)
 
 
+@pytest.mark.parametrize("varied", [{}, {"latency": 0.1, "controller.law.gain": 3.0}])
+def test_a_run_with_another_seed_is_that_run_made_anew(varied):
+    place = "kinematic", "ukf_mfac", "circle", "moderate+links=5%"
+    first, anew = RunRequest(*place, 3, varied), RunRequest(*place, 41, varied)
+    again = first.with_seed(41).with_seed(3)
+    for made, wanted in ((first.with_seed(41), anew), (again, first)):
+        assert (made, made.run_id) == (wanted, wanted.run_id)
+        assert list(made.as_row().items()) == list(wanted.as_row().items())
+    with pytest.raises(ConfigurationError, match="seed must be a non-negative integer, got -1"):
+        first.with_seed(-1)
+
+
 def test_a_resolved_run_holds_what_the_user_set_and_what_the_request_varies():
     law = {"law": {"gain": 4.0}}
     settings = Settings({"run": {"preview_time": 0.15}, "circle": {"laps": 1}, "ukf_mfac": law})
