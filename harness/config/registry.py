@@ -75,6 +75,11 @@ def offering(given: Iterable[Offer] = ()) -> Iterator[None]:
             mapping.update(former)
 
 
+def _code_of(own: Offer) -> tuple[str, str, str]:
+    """Return which code it is, however a user writes the path of its file."""
+    return Path(own.place).name, own.file, own.digest
+
+
 def offered(names: Iterable[str]) -> tuple[Offer, ...]:
     """Return those of the controllers and plants `names` that users gave."""
     return tuple(_OFFERED[name] for name in names if name in _OFFERED)
@@ -166,11 +171,7 @@ class Registry(Generic[Entry]):
             raise ConfigurationError(
                 f"{taken[name]} called {name!r} exists already; {_rename(own)}"
             )
-        if other is not None and (other.place, other.file, other.digest) != (
-            own.place,
-            own.file,
-            own.digest,
-        ):
+        if other is not None and _code_of(other) != _code_of(own):
             raise ConfigurationError(
                 f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}"
             )

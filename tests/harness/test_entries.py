@@ -87,6 +87,14 @@ def test_two_controllers_of_one_name_are_refused_and_can_be_renamed(tmp_path):
         choose_controller("./c.py")
 
 
+@pytest.mark.parametrize("path", ["mine.py", "../{folder}/mine.py", "{whole}/mine.py"])
+def test_a_file_may_be_given_again_by_another_path(tmp_path, path):
+    write(tmp_path, WHOLE, "mine.py")
+    assert choose_controller("./mine.py:Mine") == "Mine"
+    again = path.format(folder=tmp_path.name, whole=tmp_path)
+    assert choose_controller(f"{again}:Mine") == "Mine"
+
+
 def test_a_place_is_understood_in_python_too(tmp_path):
     write(tmp_path)
     table = servobench.compare(["./mine.py", "constant"], settings=SHORT)
