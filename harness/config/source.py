@@ -172,10 +172,10 @@ def same_folder() -> Iterator[None]:
             os.chdir(folder or ".")
 
 
-def make_importable(folder: Path) -> None:
-    """Let modules in a folder be imported; those that can be imported without it come first."""
+def make_importable(folder: Path, *, first: bool = False) -> None:
+    """Let modules in a folder be imported; those that can be imported without it come first, unless it is `first`."""
     if str(folder) not in sys.path:
-        sys.path.append(str(folder))
+        sys.path.insert(0 if first else len(sys.path), str(folder))
 
 
 def describe_at(error: BaseException) -> str:

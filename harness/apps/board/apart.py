@@ -130,7 +130,7 @@ def _be_controller(tell: Tell, link: int, folder: ResultsFolder, row: Row, code:
     """Answer the calls that come over a link, in the isolated process."""
     calls: Connection[Any, Any] = Connection(link, writable=False)
     watch([code.folder], lambda text: tell(["notice", text]))
-    make_importable(code.folder)
+    make_importable(code.folder, first=True)
     name = choose_controller(f"{row['controller']}={code.place}")
     if find_controller(name).needs_truth:
         raise ConfigurationError(f"{name} asks for the true robot, as ceilings do")

@@ -160,7 +160,7 @@ def _choose(head: Submission, pack: Path) -> str:
     place = head.code
     if code is not None:
         place = code.place
-        make_importable(code.folder)
+        make_importable(code.folder, first=True)
     name = choose("controller", place)
     if find_controller(name).needs_truth:
         raise ConfigurationError(f"{name} knows the true robot: it is a ceiling, no submission")

@@ -186,15 +186,21 @@ def test_what_cannot_be_submitted_is_refused_and_leaves_nothing(tmp_path, given,
     assert not (tmp_path / "out").exists()
 
 
-def test_a_controller_in_a_wheel_is_packed_run_and_verified(tmp_path):
-    with zipfile.ZipFile(tmp_path / "my_law-1.0-py3-none-any.whl", "w") as wheel:
-        wheel.writestr("my_law.py", STEPPING)
-        wheel.writestr("my_law-1.0.dist-info/METADATA", "Name: my_law\nVersion: 1.0\n")
-        points = "[servobench.controllers]\nmine = my_law:Mine\n"
-        wheel.writestr("my_law-1.0.dist-info/entry_points.txt", points)
-    submit("my_law-1.0-py3-none-any.whl", tmp_path / "it", "", ["mounting"], HOW)
+def test_a_controller_in_a_wheel_is_packed_run_and_verified(tmp_path, monkeypatch):
+    name = "law_in_a_wheel-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(tmp_path / name, "w") as wheel:
+        wheel.writestr("law_in_a_wheel.py", STEPPING)
+        wheel.writestr(
+            "law_in_a_wheel-1.0.dist-info/METADATA", "Name: law_in_a_wheel\nVersion: 1.0\n"
+        )
+        points = "[servobench.controllers]\nmine = law_in_a_wheel:Mine\n"
+        wheel.writestr("law_in_a_wheel-1.0.dist-info/entry_points.txt", points)
+    # Its author has another state of the module at hand.
+    write(tmp_path, "", "checkout/law_in_a_wheel.py")
+    monkeypatch.syspath_prepend(tmp_path / "checkout")
+    submit(name, tmp_path / "it", "", ["mounting"], HOW)
     head = Submission.read(tmp_path / "it")
-    assert (head.method, head.code) == ("Mine", "my_law-1.0-py3-none-any.whl")
+    assert (head.method, head.code) == ("Mine", name)
     # Elsewhere, as a process has one module of a name
     said = python("-c", CHECK, path=tmp_path)
     assert said.returncode == 0, said
