@@ -17,7 +17,7 @@ over whitened residuals r_k, with Student's loss for outliers and Cauchy priors,
 large ones cost little. Members count by exp(−cost/2).
 
 Each step makes one iteration, so that the work of a step does not depend on a clock. Frames are kept in a buffer: the
-last ones, and of older ones a set that is thinned evenly.
+last ones and the first ones, and of others a set that is thinned evenly.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from servobench.plant.contract.signals import BoolArray
 FRAMES = 160  # rows of the buffer
 KEPT = 96  # frames that are kept; all rows are used where frames are late, as each of them tells less then
 RECENT = 36  # the last of them, which are not thinned
+# Nor are the first ones: on a steady curve a latency looks like a turn of the base, at its beginning it does not.
+BEGINNING = 24
 LONGEST = 0.55  # [s] longest latency that is considered
 GRID = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
 # Sizes of random deviations at which members begin, in four classes
@@ -186,7 +188,7 @@ def _thinned(frames: Frames) -> Frames:
     """Return the buffer without the old frame whose neighbours are nearest to each other in time."""
     rows = np.arange(FRAMES)
     gaps = frames.time[..., 2:] - frames.time[..., :-2]
-    old = rows[2:] < frames.number[..., None] - RECENT
+    old = (rows[2:] > BEGINNING) & (rows[2:] < frames.number[..., None] - RECENT)
     dropped = 1 + np.where(old, gaps, np.inf).argmin(axis=-1)
     thinned = _moved_up(frames, rows >= dropped[..., None])
     return thinned._replace(number=frames.number - 1)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from servobench.controllers.stages.arm_fit import (
+    BEGINNING,
     FRAMES,
     KEPT,
     RECENT,
@@ -111,7 +112,7 @@ def test_joints_between_rows_are_those_of_a_smooth_motion():
 
 
 @pytest.mark.parametrize("most", [KEPT, FRAMES])
-def test_a_full_buffer_keeps_the_last_frames_and_thins_the_others_evenly(most):
+def test_a_full_buffer_keeps_the_first_and_last_frames_and_thins_the_others_evenly(most):
     fit = fit_of_ur5()
     frames = empty(fit)
     count = 1000
@@ -123,8 +124,8 @@ def test_a_full_buffer_keeps_the_last_frames_and_thins_the_others_evenly(most):
     np.testing.assert_array_equal(
         frames.time[most - RECENT : most], np.arange(count - RECENT, count)
     )
-    assert frames.time[0] == 0.0
-    gaps = np.diff(frames.time[: most - RECENT])
+    np.testing.assert_array_equal(frames.time[:BEGINNING], np.arange(BEGINNING))
+    gaps = np.diff(frames.time[BEGINNING : most - RECENT])
     assert gaps.max() <= 3.0 * np.median(gaps)
     np.testing.assert_array_equal(frames.feature[:most, 0], frames.time[:most])
 
