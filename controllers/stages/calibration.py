@@ -165,8 +165,8 @@ class Calibration:
         # Periods after a frame in which members are fitted and arms are searched for
         self._fitting = min(1, self._spread - 1)
         self._searching = min(2, self._spread - 1)
-        # Short periods are either for new arms or for an iteration.
-        self._cycle = 2 if self._spread > LONG_SPREAD else 1
+        # Short periods are for new arms and for an iteration in turn, long ones for both.
+        self._cycle = 1 + int(self._spread > LONG_SPREAD)
 
     def start(self, observation: Observation) -> CalibrationState:
         """Return the state before any frame."""
