@@ -80,10 +80,10 @@ MOVE_ERROR = 3.0  # [1] error of a frame in σ from which on it tells a moved ca
 MIN_EXPONENT = -100.0  # exponent of a weight: its square does not underflow
 MIN_TOTAL = 1e-12  # [1] sum of weights by which they are divided
 CANDIDATES = 8  # new members from frame to frame
-LONG_SPREAD = 4  # periods of a frame up to which a period is long enough for both
 SCREENED = 256  # arms at most of which these are the best, before any iteration
 SCREENING_WORK = 4096  # product of them and frames that is not exceeded
 SCREENING = 25.0  # [1] factor of the variance by which they are compared, as no arm is near yet
+LONG_SPREAD = 4  # periods of a frame up to which each has time for new arms and for an iteration
 
 
 class Regressed(NamedTuple):
