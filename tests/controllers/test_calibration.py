@@ -51,10 +51,10 @@ def test_the_latency_of_frames_is_found():
 
 def test_zeros_that_are_all_unknown_are_found_by_new_members_and_never_without(monkeypatch):
     unknown = "moderate+joint_offsets=180deg"
-    found = carry_out(run(unknown, 88706, task="tour")).steps
+    found = carry_out(run(unknown, 88703, task="tour")).steps
     assert found["jacobian_error"].iloc[-1] < 0.03
     monkeypatch.setattr(calibration, "SEARCH_TIME", 0.0)
-    without = carry_out(run(unknown, 88706, task="tour")).steps
+    without = carry_out(run(unknown, 88703, task="tour")).steps
     assert without["jacobian_error"].iloc[-1] > 0.1
 
 
@@ -68,11 +68,11 @@ def test_the_search_explains_the_frames_of_unknown_zeros_much_sooner(monkeypatch
     assert np.median(found) < 0.5 * np.median(without)
 
 
-@pytest.mark.parametrize(("period", "tries"), [(0.05, 88700), (0.008, 88708)])
-def test_runs_side_by_side_have_equal_bits_while_some_of_them_try_new_members(period, tries):
+@pytest.mark.parametrize("period", [0.05, 0.008])
+def test_runs_side_by_side_have_equal_bits_while_some_of_them_try_new_members(period):
     brief = {"random": {"duration": 1.8}, "run": {"period": period}}
     unknown = "moderate+joint_offsets=180deg"
-    runs = [run(unknown, seed, settings=brief, task="random") for seed in (tries, 88701)]
+    runs = [run(unknown, seed, settings=brief, task="random") for seed in (88714, 88701)]
     assert_rows_of_single_runs(runs)
 
 
@@ -93,7 +93,7 @@ def test_a_frames_iterations_are_spread_over_the_periods_to_the_next(monkeypatch
     monkeypatch.setattr(calibration.Calibration, "update", updated)
     monkeypatch.setattr(Fit, "iterated", counted)
     brief = {"random": {"duration": 1.2}, "run": {"period": period}}
-    far = run("moderate+joint_offsets=180deg", 88701, settings=brief, task="random")
+    far = run("moderate+joint_offsets=180deg", 88714, settings=brief, task="random")
     steps = carry_out(far).steps
     assert max(made) == most
     # Arms are searched for in most of the periods, and some are fitted.
