@@ -66,8 +66,9 @@ class Submission:
             ConfigurationError: there is none, or it is damaged.
         """
         file = folder / HEAD
-        with configuration_errors(f"{file}: "):
-            return override("submission", cls(), read_toml("submission", file))
+        with configuration_errors():
+            table = read_toml("submission, as submit writes it:", file)
+            return override(str(file), cls(), table)
 
     def write(self, folder: Path) -> None:
         """Write it into a folder."""
