@@ -709,7 +709,7 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_arms")
 @pytest.mark.parametrize(
-    ("sensing", "seed", "duration"), [("position", 88702, 60.0), ("pixel", 88709, 40.0)]
+    ("sensing", "seed", "duration"), [("position", 88702, 60.0), ("pixel", 88710, 40.0)]
 )
 def test_an_arm_far_from_the_nominal_one_is_found_by_the_search(sensing, seed, duration):
     settings = {"random": {"duration": duration}, "Excite": {"swing": 0.25}}
