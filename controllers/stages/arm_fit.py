@@ -39,8 +39,8 @@ RECENT = 36  # the last of them, which are not thinned
 BEGINNING = 24
 LONGEST = 0.55  # [s] longest latency that is considered
 GRID = 0.05  # [s], at least a period, between joint positions that are kept beside a frame
-# Sizes of random deviations at which members begin, in four classes: wrong gears above all, wrong zeros above all, and
-# all wrong, twice. With zeros in but one class the search found them late.
+# Sizes of random deviations at which members begin, in four classes: arms with wrong gears, arms with wrong zeros, and
+# two in which everything is wrong. Three of them have far zeros: with one, the search found such zeros late.
 SPREADS = {
     "zero": (0.1, 2.0, 3.1, 3.1),  # [rad]
     "gear": (0.4, 0.05, 0.4, 0.4),  # [1]
