@@ -62,7 +62,7 @@ CORES = {
 """a_i, cores of the Cauchy priors, in the same units."""
 # [1], [rad] largest deviations of a member
 LARGEST = {"gear": 0.7, "link": 0.8, "play": 0.1, "ripple": 0.1}
-RIPPLE_ORDER = 8.0  # k [1], periods of the ripple in a turn
+ORDERS = np.arange(2.0, 17.0)  # k [1], periods of the ripple in a turn, one for each member
 ASSUMED_PLAY = 0.002  # [rad] b by which x moves while less is fitted
 LATENCY = (0.1, 0.3)  # [s] L₀ and σ_L
 # [s] between which it lies. Encoders may be late themselves, by a little: with more, a camera that turns and a frame
@@ -102,6 +102,7 @@ class Members(NamedTuple):
     cameras: FloatArray  # (..., E, c, 4, 4)
     latency: FloatArray  # L, (..., E) [s]
     turning: FloatArray  # ω, (..., E) [rad/s]
+    order: FloatArray  # k, (..., E) [1]
     damping: FloatArray  # λ of Levenberg and Marquardt, (..., E)
     cost: FloatArray  # (..., E)
     variance: FloatArray  # σ² of the residuals with which they begin, (..., E)
@@ -341,10 +342,26 @@ class Fit:
             cameras=np.broadcast_to(planned, (*size, *planned.shape)),
             latency=np.repeat(late, count, axis=-1),
             turning=np.zeros(size),
+            order=ORDERS[rows % len(ORDERS)],
             damping=np.full(size, FIRST_DAMPING),
             cost=np.full(size, np.inf),
             variance=np.zeros(size),
         )
+
+    def challenged(self, members: Members, number: IntArray) -> Members:
+        """Return members of which the worst one has become the best one, with a ripple of another order.
+
+        Few members are left when all else is known of the arm; so they try one order after the other.
+
+        Args:
+            members: (..., E).
+            number: of the order, (...).
+        """
+        ordered = members.best(members.cost.shape[-1])
+        best = members.picked(ordered[..., :1])
+        best.theta[..., self._ripple] = 0.0
+        challenger = best._replace(order=ORDERS[number[..., None] % len(ORDERS)])
+        return members.picked(ordered[..., :-1]).beside(challenger)
 
     def aligned(self, members: Members, frames: Frames) -> tuple[Members, FloatArray]:
         """Return members whose cameras are placed where their arms fit the frames best, with their residuals.
@@ -426,9 +443,10 @@ class Fit:
         q, x = np.split(row, 2, axis=-1)
         play = members.theta[..., self._play, None, None]
         ripple = members.theta[..., self._ripple, None, None]
-        phase = RIPPLE_ORDER * q
+        order = members.order[..., None, None]
+        phase = order * q
         wave = np.sin(phase)
-        slope = 1.0 + ripple * RIPPLE_ORDER * np.cos(phase)
+        slope = 1.0 + ripple * order * np.cos(phase)
         return Geared(q + ripple * wave + play * x, slope, wave, x)
 
     def next_row(

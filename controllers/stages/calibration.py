@@ -61,6 +61,7 @@ SEARCH_TIME = (
 )
 SEARCH_ITERATIONS = 8  # their iterations from frame to frame
 ITERATION_INTERVAL = 2  # frames from one iteration to the next, once all are explained
+RIPPLE_ITERATIONS = 4  # for which another order is tried; shares no factor with their number
 MIN_MOTION = 5.0  # [1] motion of a feature, in σ, before anything is fitted
 NOISE = (0.5e-3, 2e-2)  # [m] least and largest σ, in natural units
 BIAS_TIME = 0.4  # [s] over which the residuals' mean is taken
@@ -131,7 +132,7 @@ class CalibrationState(NamedTuple):
     used: BoolArray  # (...), whether the arm is believed
     moves: IntArray  # those of the regression at the last frame, (...)
     passed: IntArray  # frames since the last iteration, (...)
-    spawned: IntArray  # members begun so far, (...)
+    spawned: IntArray  # members begun so far, and iterations of other ripples, (...)
     past: tuple[Known, ...]  # the last `HORIZON` frames, the oldest first
 
     @property
@@ -311,6 +312,11 @@ class Calibration:
 
         explained = many & (state.rms < EXPLAINED * noise)
         fits = phase == self._fitting
+        tries = unexplained & (state.elapsed > SEARCH_TIME) & fits
+        number = state.spawned
+        begins = tries & (number % RIPPLE_ITERATIONS == 0)
+        members = branch(begins, self.fit.challenged, state.members, number)
+        state = state._replace(members=members, spawned=number + tries)
         iterates = state.fitted & (~explained | (state.passed >= ITERATION_INTERVAL))
         state = _by_size(fits & iterates, self._continued, state, level)
         used = np.where(fits, self._trusted(state), state.used & state.fitted)

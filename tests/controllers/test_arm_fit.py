@@ -194,12 +194,17 @@ def test_derivatives_of_residuals_are_those_of_differences():
 
 def test_play_and_ripple_of_the_plants_gears_are_found():
     fit = fit_of_ur5()
-    frames, _, _ = made_up(fit, 6.0, mechanics=MechanicsConfig(backlash=0.015, ripple=0.02))
+    gears = MechanicsConfig(backlash=0.015, ripple=0.02, ripple_order=10.0)
+    frames, _, _ = made_up(fit, 6.0, mechanics=gears)
     members, _ = fit.aligned(fit.start((), 8, np.float64(0.1)), frames)
     variance = np.full(8, NOISE**2)
-    for _ in range(60):
+    for number in range(80):
+        if number % 4 == 0:
+            members = fit.challenged(members, np.int_(number))
         members, _ = fit.iterated(members, frames, np.float64(0.0), variance)
-    best = members.theta[int(members.cost.argmin())]
+    first = int(members.cost.argmin())
+    best = members.theta[first]
+    assert members.order[first] == gears.ripple_order
     assert best[RIPPLE] == pytest.approx(0.02, abs=2e-3)
     assert best[PLAY] == pytest.approx(0.015, abs=3e-3)
 

@@ -153,10 +153,12 @@ def test_a_law_with_a_preview_of_its_own_knows_how_the_camera_turns():
     assert row["rms_error_evaluated"] < 1e-3
 
 
-def test_play_and_ripple_of_gears_are_found_and_reckoned_with():
+@pytest.mark.parametrize("order", [5.0, 8.0])
+def test_play_and_ripple_of_gears_are_found_and_reckoned_with(order):
     geared = "moderate+backlash=1deg+ripple=0.03rad"
-    calibrated = carry_out(run(geared))
-    regressed = carry_out(run(geared, settings=REGRESSING))
+    gears = {"kinematic": {"mechanics": {"ripple_order": order}}}
+    calibrated = carry_out(run(geared, settings=gears))
+    regressed = carry_out(run(geared, settings=gears | REGRESSING))
     error = "rms_error_evaluated"
     assert calibrated.row[error] < 0.5 * regressed.row[error]
     last = calibrated.steps.iloc[-1]
