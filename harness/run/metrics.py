@@ -1,14 +1,16 @@
 """The metrics of a run, computed from its logged rows: `METRICS` declares each one, `judge_run` computes them.
 
 A metric is one declaration: its column in the table of runs, its unit, its definition, how and where tables and figures
-show it, and the function that computes it. docs/results.md, the tables of a command, `servobench statistics` and the
-report are made from the declarations. All errors are those of the true feature.
+show it, which stand in `metrics.toml`, and the function that computes it. docs/results.md, the tables of a command,
+`servobench statistics` and the report are made from the declarations. All errors are those of the true feature.
 """
 
 import math
+import tomllib
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -300,177 +302,62 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
     return np.array(summaries).reshape(values.shape[:-1])
 
 
-_ALL = (
-    Metric(
-        "settling_time_s", "s", "settling time", 2,
-        "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row "
-        "is outside, or the error came in less than 0.5 s before the end",
-        lambda run: settling_time(run.error, run.steps.spec.feature.band, run.period),
-        tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary(2, "point_to_point"),
+_VALUES: Mapping[str, Callable[[Judged], FloatArray]] = {
+    "settling_time_s": lambda run: settling_time(
+        run.error, run.steps.spec.feature.band, run.period
     ),
-    Metric(
-        "settling_time_5pct_s", "s", "settling time, 5 % band", 2,
-        "the same with 5 % of e_0",
-        lambda run: settling_time(run.error, SETTLING_SHARE * run.error[..., 0], run.period),
+    "settling_time_5pct_s": lambda run: settling_time(
+        run.error, SETTLING_SHARE * run.error[..., 0], run.period
     ),
-    Metric(
-        "settling_time_first_s", "s", "first move", 2,
-        "settling time of the first move of a sequence, such as `tour`, from its jump on, while its target is held",
-        lambda run: _median_time(run, slice(0, 1)), kind="sequence", summary=Summary(2, "sequence"),
+    "settling_time_first_s": lambda run: _median_time(run, slice(0, 1)),
+    "settling_time_second_s": lambda run: _median_time(run, slice(1, 2)),
+    "settling_time_later_s": lambda run: _median_time(run, slice(2, None)),
+    "overshoot": lambda run: (
+        overshoot(run.feature, run.reference[..., 0]) if run.fixed else run.same(np.nan)
     ),
-    Metric(
-        "settling_time_second_s", "s", "second move", 2,
-        "likewise of the second move",
-        lambda run: _median_time(run, slice(1, 2)), kind="sequence", summary=Summary(2, "sequence"),
+    "steady_state_error": lambda run: run.error[..., final_rows(run.period)].mean(axis=-1),
+    "rms_error": lambda run: _rms(run, run.error),
+    "max_error": lambda run: run.error.max(axis=-1),
+    "rms_error_second_lap": lambda run: _rms(run, run.second_lap),
+    "rms_error_evaluated": lambda run: _rms(run, run.evaluated),
+    "log_error": lambda run: log_error(run.error, run.steps.spec.feature.band),
+    "path_length_ratio": _path_length_ratio,
+    "max_joint_position_rad": lambda run: np.abs(_columns(run.steps.joint_position)).max(
+        axis=(-2, -1)
     ),
-    Metric(
-        "settling_time_later_s", "s", "later moves", 2,
-        "median of those of the third and later moves; NaN if one of them did not settle",
-        lambda run: _median_time(run, slice(2, None)), kind="sequence",
-        tables={"moves": "Time"}, figure="settling", summary=Summary(2, "sequence"),
+    "control_effort_rad": lambda run: flat(np.abs(run.command)).sum(axis=-1) * run.period,
+    "saturation_fraction": _saturation,
+    "joint_acceleration_peak_rad_s2": lambda run: _peak(run, run.acceleration),
+    "joint_acceleration_rms_rad_s2": lambda run: _rms(run, flat(run.acceleration)),
+    "joint_jerk_peak_rad_s3": lambda run: _peak(run, run.jerk),
+    "joint_jerk_rms_rad_s3": lambda run: _rms(run, flat(run.jerk)),
+    "command_switches": lambda run: sign_switches(
+        run.command, run.steps.spec.joint_velocity_limit
+    ).astype(np.float64),
+    "feature_invalid_fraction": lambda run: np.mean(_columns(~run.steps.feature_valid), axis=-1),
+    "jacobian_error_mean": lambda run: _of_known(np.mean, _columns(run.steps.jacobian_error())),
+    "jacobian_condition_max": lambda run: _of_known(
+        np.max, _columns(run.steps.jacobian_condition())
     ),
-    Metric(
-        "overshoot", "1", "overshoot", 1,
-        "how far the feature passes a fixed target: max over k of (y_k − y_0)·w / (w·w) − 1 with w = y_ref − y_0, at "
-        "least 0; NaN when the reference moves",
-        lambda run: overshoot(run.feature, run.reference[..., 0]) if run.fixed else run.same(np.nan),
-        percent=True, tables={"moves": "Time"}, summary=Summary(0, "point_to_point"),
+    "controller_time_median_us": lambda run: run.same(float(np.median(run.steps.controller_time))),
+    "controller_time_p99_us": lambda run: run.same(
+        float(np.quantile(run.steps.controller_time, 0.99))
     ),
-    Metric(
-        "steady_state_error", "", "error of the last second", 2,
-        "mean of e over the last second",
-        lambda run: run.error[..., final_rows(run.period)].mean(axis=-1),
-        tables={"moves": "Error", "runs": "Error"}, summary=Summary(1, "point_to_point"),
-    ),
-    Metric(
-        "rms_error", "", "RMS error of the run", 2,
-        "root mean square of e over all rows",
-        lambda run: _rms(run, run.error),
-    ),
-    Metric(
-        "max_error", "", "largest error", 1,
-        "largest e",
-        lambda run: run.error.max(axis=-1),
-    ),
-    Metric(
-        "rms_error_second_lap", "", "RMS error of the second lap", 2,
-        "the same over the second lap, the first one after the entry; NaN where nothing is repeated",
-        lambda run: _rms(run, run.second_lap),
-        tables={"curves": "RMS error"}, summary=Summary(1, "curve"),
-    ),
-    Metric(
-        "rms_error_evaluated", "", "RMS error of the judged part", 2,
-        "the same over the judged part of the [task](tasks.md); NaN if the run ended before it",
-        lambda run: _rms(run, run.evaluated),
-        tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary(1, "curve"),
-    ),
-    Metric(
-        "log_error", "1", "mean logarithmic error", 2,
-        "mean over all rows of log₁₀(e / 0.3 `settling_band`), at least 0; a measure for tuning",
-        lambda run: log_error(run.error, run.steps.spec.feature.band),
-    ),
-    Metric(
-        "path_length_ratio", "1", "path ratio", 3,
-        "length of the true path over the distance from start to target, or over the path of a moving reference",
-        _path_length_ratio, tables={"moves": "Motion"},
-    ),
-    Metric(
-        "max_joint_position_rad", "rad", "largest joint position", 2,
-        "largest |q| that the encoders report",
-        lambda run: np.abs(_columns(run.steps.joint_position)).max(axis=(-2, -1)),
-        better="", tables={"curves": "Motion"}, summary=Summary(2, "curve"),
-    ),
-    Metric(
-        "control_effort_rad", "rad", "control effort", 2,
-        "sum of |u| dt over joints and rows",
-        lambda run: flat(np.abs(run.command)).sum(axis=-1) * run.period,
-        tables={"cost": "Joints", "runs": "Motion"}, figure="effort",
-    ),
-    Metric(
-        "saturation_fraction", "1", "saturated periods", 1,
-        "share of rows that command a joint at its speed limit",
-        _saturation, percent=True, tables={"cost": "Joints"}, figure="effort",
-    ),
-    Metric(
-        "joint_acceleration_peak_rad_s2", "rad/s²", "peak acceleration", 1,
-        "largest |a|, a_k = (u_k − u_(k−1)) / dt of consecutive commands (not the first one, from rest); NaN for a "
-        "single row. Compare only runs of equal periods",
-        lambda run: _peak(run, run.acceleration),
-    ),
-    Metric(
-        "joint_acceleration_rms_rad_s2", "rad/s²", "RMS acceleration", 2,
-        "root of the mean of a² over joints and rows",
-        lambda run: _rms(run, flat(run.acceleration)),
-        tables={"cost": "Joints"}, figure="smoothness",
-    ),
-    Metric(
-        "joint_jerk_peak_rad_s3", "rad/s³", "peak jerk", 0,
-        "largest |j|, j_k = (a_k − a_(k−1)) / dt; NaN for fewer than three rows",
-        lambda run: _peak(run, run.jerk),
-    ),
-    Metric(
-        "joint_jerk_rms_rad_s3", "rad/s³", "RMS jerk", 1,
-        "root of the mean of j² over joints and rows",
-        lambda run: _rms(run, flat(run.jerk)),
-        tables={"cost": "Joints"}, figure="smoothness",
-    ),
-    Metric(
-        "command_switches", "1", "sign switches", 0,
-        "periods in which a joint's command, of at least 10 % of its speed limit, has the opposite sign of the last "
-        "such command one or two periods before; sum over joints",
-        lambda run: sign_switches(run.command, run.steps.spec.joint_velocity_limit).astype(np.float64),
-        tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary(0),
-    ),
-    Metric(
-        "feature_invalid_fraction", "1", "periods without a feature", 1,
-        "share of rows without a valid feature",
-        lambda run: np.mean(_columns(~run.steps.feature_valid), axis=-1), percent=True,
-    ),
-    Metric(
-        "jacobian_error_mean", "1", "mean Jacobian error", 1,
-        "mean of `jacobian_error` over the rows that have one",
-        lambda run: _of_known(np.mean, _columns(run.steps.jacobian_error())),
-        percent=True, tables={"cost": "Estimate"},
-    ),
-    Metric(
-        "jacobian_condition_max", "1", "largest condition number", 0,
-        "largest `jacobian_condition`",
-        lambda run: _of_known(np.max, _columns(run.steps.jacobian_condition())), better="",
-    ),
-    Metric(
-        "controller_time_median_us", "µs", "step, median", 0,
-        "median of `controller_time_us`; times are null where runs [advanced together](experiments.md#sweeps)",
-        lambda run: run.same(float(np.median(run.steps.controller_time))),
-        tables={"cost": "Step of the controller"}, summary=Summary(0),
-    ),
-    Metric(
-        "controller_time_p99_us", "µs", "step, 99 %", 0,
-        "99th percentile of it",
-        lambda run: run.same(float(np.quantile(run.steps.controller_time, 0.99))),
-        tables={"cost": "Step of the controller"},
-    ),
-    Metric(
-        "controller_time_overruns", "1", "steps over the period", 0,
-        "rows in which it exceeds the period",
-        _overruns, tables={"cost": "Step of the controller"},
-    ),
-    Metric(
-        "plant_time_median_us", "µs", "plant step, median", 0,
-        "median of `plant_time_us`",
-        lambda run: run.same(float(np.median(run.steps.plant_time))), better="",
-    ),
-    Metric(
-        "pose_error_mm", "mm", "pose error of the last second", 1,
-        "mean distance of the target from its taught position over the last second; only where sensing judges the pose",
-        tables={"moves": "Error"},
-    ),
-    Metric(
-        "pose_error_deg", "deg", "angle error of the last second", 2,
-        "likewise its mean rotation",
-        tables={"moves": "Error"},
-    ),
-)  # fmt: skip
-BUILT_IN = {metric.column: metric for metric in _ALL}
+    "controller_time_overruns": _overruns,
+    "plant_time_median_us": lambda run: run.same(float(np.median(run.steps.plant_time))),
+}
+"""What computes a metric, by its name; the pose errors are known to the sensing set-up alone."""
+
+
+def _declared(column: str, summary: Any = None, **entry: Any) -> Metric:  # noqa: ANN401
+    """Return the metric of an entry of `metrics.toml`."""
+    if summary is not None:
+        summary = Summary(**summary)
+    return Metric(column, values=_VALUES.get(column), summary=summary, **entry)
+
+
+_TABLE = tomllib.loads(files(__package__).joinpath("metrics.toml").read_text(encoding="utf-8"))
+BUILT_IN = {column: _declared(column, **entry) for column, entry in _TABLE.items()}
 """Every metric of this package by the name of its column, in the order of the table of runs."""
 METRICS: Mapping[str, Metric] = ChainMap(DECLARED, BUILT_IN)
 """The same, and then those of users that the present command knows."""
