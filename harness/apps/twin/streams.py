@@ -24,10 +24,14 @@ from servobench.plant.contract.signals import COMMAND, PlantSpec, column_names
 
 RECEIVED = "received"  # column with the times of recording
 STAMP = "header.stamp"
+VALID = "feature_valid"  # column of a table, 0 in rows without a new frame
 NANOSECOND = 1e-9  # [s]
 MAX_PARTS = 64  # entries of a list in a message that may be values; images have more
-# [s] Usual distance of stamps above which they are likely in another unit.
-MAX_STEP = 5.0
+STEPS = (1e-5, 5.0)  # [s] Usual distance of stamps, beyond which they are likely in another unit.
+# [s] Longest gaps of a recording without a pause, if they are longer than MAX_LOST usual steps: between joints these
+# are interpolated, and a ball may be hidden for a while.
+MAX_GAPS = {"joints": 0.2, "features": 60.0}
+MAX_LOST = 10.0
 FAULTS = (struct.error, TypeError, KeyError, EOFError, RuntimeError, OSError)
 """Errors of rosbags about a damaged bag, beside its own."""
 
@@ -138,11 +142,15 @@ def read_stream(path: Path, kind: str, keys: StreamMap, spec: PlantSpec) -> Stre
             f"{what} has no {lacking[0]}; name topic, time and fields in [{kind}] of the map: {known}"
         )
     table = table[table[columns].notna().all(axis=1)]
+    if kind == "features" and VALID in table:
+        table = table[table[VALID].astype(bool)]
     time = keys.offset + _seconds(what, table, stamps, keys.unit)
     _check_order(what, time)
+    _check_gaps(what, time, MAX_GAPS.get(kind, np.inf))
     received = np.full(len(table), np.nan)
     if RECEIVED in table:
         received = _seconds(what, table, RECEIVED, keys.unit)
+        _check_unit(f"{what}, {RECEIVED}", received)
     return Stream(time, received, keys.scale * numbers_of(what, table, columns))
 
 
@@ -152,7 +160,7 @@ def _seconds(what: str, table: pd.DataFrame, column: str, unit: str) -> FloatArr
     if stamps.dtype.kind not in "iuf":
         with configuration_errors(f"{what}: {column} is neither numbers nor dates of ISO 8601: "):
             dates = pd.to_datetime(stamps, utc=True, format="ISO8601")
-        table = table.assign(**{column: (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()})
+        return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
     return numbers_of(what, table, [column])[:, 0] / PER_SECOND.get(unit, 1.0)
 
 
@@ -165,10 +173,27 @@ def _check_order(what: str, time: FloatArray) -> None:
         raise UnevenRows(
             f"{what}: stamp {np.argmin(grows) + 1} of {len(time)} is not later than the one before: {remedy}"
         )
-    usual = np.median(steps)
-    if usual > MAX_STEP:
-        remedy = 'write their unit, such as unit = "ns", in the map'
+    _check_unit(what, time)
+
+
+def _check_unit(what: str, time: FloatArray) -> None:
+    """Refuse stamps that are likely in another unit."""
+    usual = np.median(np.diff(time))
+    least, most = STEPS
+    if not least <= usual <= most:
+        remedy = 'write their unit, such as unit = "ns" or "s", in the map'
         raise ConfigurationError(f"{what}: stamps are {usual:.4g} s apart; {remedy}")
+
+
+def _check_gaps(what: str, time: FloatArray, most: float) -> None:
+    """Refuse a pause of the recording, over which joints would be guessed and frames would count as lost."""
+    steps = np.diff(time)
+    place = steps.argmax()
+    if steps[place] > max(most, MAX_LOST * np.median(steps)):
+        raise ConfigurationError(
+            f"{what}: none for {steps[place]:.4g} s after stamp {place + 1}, as where a recording pauses or a clock "
+            "is set: cut the log there"
+        )
 
 
 def _read_topic(path: Path, topic: str) -> pd.DataFrame:
@@ -205,7 +230,8 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 -
         yield name, value.sec + NANOSECOND * value.nanosec
     elif hasattr(value, "position") and hasattr(value, "name"):
         yield from _flat("header", value.header)
-        yield from zip(value.name, value.position.tolist(), strict=True)
+        # Of some devices positions are empty.
+        yield from zip(value.name, value.position.tolist(), strict=False)
     elif is_dataclass(value):
         for each in fields(value):
             yield from _flat(f"{name}.{each.name}".lstrip("."), getattr(value, each.name))

@@ -95,7 +95,8 @@ def write_bag(folder, plugin=StoragePlugin.MCAP, seconds=40.0):
     for t, stamp, q in zip(sampled, stamps(sampled, draws), motion(sampled), strict=True):
         message = state(header(stamp), names, q[order], none, none)
         events.append((t + 0.003, "/joint_states", message))
-        gripper = state(header(stamp), ["finger_joint"], np.zeros(1), none, none)
+        # A device may tell no positions at all.
+        gripper = state(header(stamp), ["finger_joint"], np.zeros(len(events) % 4 // 2), none, none)
         events.append((t + 0.003, "/joint_states", gripper))
     for t, stamp, y in zip(exposed, stamps(exposed + OFFSET, draws), features, strict=True):
         place = TYPES["geometry_msgs/msg/Point"](*y.tolist())
@@ -289,7 +290,8 @@ WRONG = {  # files, the changed map or file, words of the refusal
     "stamps": ("map", MAP.replace("%time", "time"), f"no time{NAME} [joints] of the map: did you mean '%time'"),
     "another robot": ("robot", MAP, f"has no joint_position_joint_1_rad{NAME} [joints] of the map"),
     "a key": ("map", MAP + "topics = 1\n", "has no setting 'topics': did you mean 'topic'"),
-    "a unit": ("map", MAP.replace('"ns"', '"ms"', 1), 's apart; write their unit, such as unit = "ns", in the map'),
+    "a unit": ("map", MAP.replace('"ns"', '"ms"', 1), 's apart; write their unit, such as unit = "ns" or "s"'),
+    "a unit of seconds": ("bag", '[joints]\nunit = "ns"\n', "e-12 s apart; write their unit"),
     "a date": ("map", MAP.replace('"stamp"', '"word"'), "word is neither numbers nor dates of ISO 8601"),
     "no overlap": ("map", LATE, "do not overlap: features run from 17"),
     "no bag": ("features.csv", "features.bag", "cannot be read as a bag"),
@@ -326,6 +328,30 @@ def test_stamps_out_of_order_and_doubled_end_with_code_1(tmp_path, output_of):
         assert "leave out doubled ones" in said
 
 
+def test_a_pause_of_the_recording_and_a_clock_that_is_set_are_refused(tmp_path, refusal_of):
+    joints, features, columns = write_tables(tmp_path, seconds=4.0)
+    words = ("identify", "--joints", joints, "--features", features, "--columns", columns)
+    whole = pd.read_csv(joints)
+    later = whole["%time"] + 10**18 * (whole.index >= 100)
+    broken = {"0.4": whole.drop(range(100, 150)), "1e+09": whole.assign(**{"%time": later})}
+    for seconds, table in broken.items():
+        table.to_csv(joints, index=False)
+        said = refusal_of(*words, "--robot", ROBOT)
+        assert f"joints of {joints}: none for {seconds}" in said
+        assert (
+            "s after stamp 100, as where a recording pauses or a clock is set: cut the log" in said
+        )
+
+
+def test_a_cameras_clock_that_is_set_by_less_is_named_by_what_follows(tmp_path, output_of):
+    joints, features, columns = write_tables(tmp_path)
+    table = pd.read_csv(features)
+    table["stamp"] += 10**10 * (table.index >= len(table) // 2)
+    table.to_csv(features, index=False)
+    words = ("identify", "--joints", joints, "--features", features, "--columns", columns)
+    assert "cut the log there" in output_of(*words, "--robot", ROBOT, code=1)
+
+
 def test_a_stream_without_any_finite_feature_is_refused(tmp_path, refusal_of):
     joints, features, columns = write_tables(tmp_path, seconds=2.0, x=np.nan)
     words = ("identify", "--joints", joints, "--features", features, "--columns", columns)
@@ -339,6 +365,9 @@ def test_frames_without_a_detection_are_no_frames(tmp_path):
     table.to_csv(features, index=False)
     found = read(joints, features, columns).table["capture_time_s"].notna().sum()
     assert found <= table["y"].notna().sum() < len(table)
+    held = table.ffill().bfill().assign(feature_valid=table["y"].notna())
+    held.to_csv(features, index=False)
+    assert read(joints, features, columns).table["capture_time_s"].notna().sum() == found
 
 
 def test_a_log_and_two_streams_are_not_given_together(tmp_path, refusal_of):
