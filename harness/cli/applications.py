@@ -1,11 +1,14 @@
 """The commands by their modules, and the applications: abilities that only their commands reach.
 
 The core stands without the applications, and nothing in it imports one: the command line finds a command here by its
-name and imports no other. A further application is a folder of `harness/apps` with `commands.py`, and a row here.
+name and imports no other. A further application is a folder of `harness/apps` with `commands.py`, and a section of
+`applications.toml`.
 """
 
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.resources import files
 from typing import Any, NamedTuple
 
 import typer
@@ -19,36 +22,18 @@ class Application(NamedTuple):
     """An application: a room of the house that only its commands lead to."""
 
     purpose: str
-    commands: tuple[str, ...] = ()
+    commands: Sequence[str] = ()
     extra: str = ""
     """the extra of pyproject.toml that it needs; empty for none"""
     package: str = ""
     """where it lies elsewhere than in `harness/apps`"""
-    further: tuple[str, ...] = ()
+    further: Sequence[str] = ()
     """packages beside it that nothing else imports"""
 
 
+_FILE = files(__package__).joinpath("applications.toml")
 APPLICATIONS = {
-    "twin": Application("arm, camera and drive identified from a log", ("shadow", "identify")),
-    "serve": Application("a plant on the ports of a UR, or as a robot of ROS 2", ("serve",)),
-    "check": Application("a plug-in begun, and held against its contract", ("new", "check")),
-    "fmu": Application(
-        "arms and controllers as FMUs", ("fmu",), further=("servobench.fmus.controllers",)
-    ),
-    "gym": Application("runs as environments of Gymnasium", extra="gym", package=f"{HARNESS}.gym"),
-    "board": Application(
-        "results that strangers can check",
-        ("selftest", "verify", "submit", "leaderboard"),
-        "report",
-    ),
-    "tuning": Application("settings found by equal budgets", ("tune",), "tune"),
-    "studies": Application("challenges and the robustness map", ("robustness", "suite")),
-    "figures": Application("pictures of a results folder, drawn from its tables", ("figures",)),
-    "exports": Application("steps of runs for other tools", ("export",)),
-    "films": Application("films and snapshots of runs", ("record",), "animation"),
-    "report": Application("a page about a results folder", ("report",), "report"),
-    "loops": Application("loops at rest: margins and limits", ("analyse",)),
-    "play": Application("a page on which runs are steered while they go on", ("play",), "play"),
+    name: Application(**row) for name, row in tomllib.loads(_FILE.read_text("utf-8")).items()
 }
 CORE = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),

@@ -160,7 +160,7 @@ def _seconds(what: str, table: pd.DataFrame, column: str, unit: str) -> FloatArr
     if stamps.dtype.kind not in "iuf":
         with configuration_errors(f"{what}: {column} is neither numbers nor dates of ISO 8601: "):
             dates = pd.to_datetime(stamps, utc=True, format="ISO8601")
-        return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
+        return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds())
     return numbers_of(what, table, [column])[:, 0] / PER_SECOND.get(unit, 1.0)
 
 
