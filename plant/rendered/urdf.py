@@ -315,7 +315,7 @@ def arm_tree(arm: SerialArm, described: Robot, payload: float = 0.0) -> ET.Eleme
             inertia = R @ inertia @ R.T
         link = add_link(robot, links[i + 1], mass[i], inertia, centre=centre, along=along)
         _draw_link(link, step, radius[i], aside[i])
-        add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
+        add_joint(robot, f"{name}_joint", (links[i], links[i + 1]), origins[i], turns=True)
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
     # The flange has a plate and the stick that carries the ball.
     flange = add_link(robot, FLANGE_LINK, *LIGHT_PART)

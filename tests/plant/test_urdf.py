@@ -28,7 +28,16 @@ UR5 = find_robot("ur5")
 BALL = 7  # link number: six joints, the flange, the ball
 
 
-ARMS = {"nominal": ur5.ur5_arm, "factory": factory_ur5, "odd": odd_ur5}
+def arm_named_like_parts():
+    return replace(ur5.ur5_arm(), joint_names=("flange", "ball", "base", "", "world", "base_link"))
+
+
+ARMS = {
+    "nominal": ur5.ur5_arm,
+    "factory": factory_ur5,
+    "odd": odd_ur5,
+    "named": arm_named_like_parts,
+}
 
 
 @pytest.fixture(params=ARMS)
