@@ -31,6 +31,7 @@ from servobench.plant.contract.settings import suggest
 
 EVERY = 16  # seeds from look to look
 DECISIONS = "decisions.csv"
+CLIPPED = "mean clipped difference"  # column of it; each difference counts up to `CLIP` margins
 Pair = tuple[str, str]
 
 
@@ -109,7 +110,7 @@ class Answer:
             "verdict": verdict,
             "seeds": str(self.decision.robots),
             "runs lost": f"{lost_first} : {lost_second}",
-            "mean difference": number(self.decision.mean * self.margin, "+.2f"),
+            CLIPPED: number(self.decision.mean * self.margin, "+.2f"),
             "margin": f"{self.margin:.2g}",
             "measure": self.measure,
         }

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pandas as pd
 
 from servobench.harness.analysis.decisions import (
+    CLIPPED,
     DECISIONS,
     Answer,
     Question,
@@ -80,7 +81,7 @@ def save_decisions(folder: ResultsFolder, answers: Sequence[Answer]) -> None:
     path = folder.path / DECISIONS
     table = answer_table(answers)
     # A number: a text that begins with a sign would be marked as one that no spreadsheet may compute
-    table["mean difference"] = pd.to_numeric(table["mean difference"], errors="coerce")
+    table[CLIPPED] = pd.to_numeric(table[CLIPPED], errors="coerce")
     write_csv(table, path)
     folder.vouch([path])
 

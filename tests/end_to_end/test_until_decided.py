@@ -30,7 +30,7 @@ def undisturbed(tmp_path_factory) -> Path:
 def test_it_ends_at_the_look_that_decides_and_says_so(undisturbed, capsys, monkeypatch):
     (row,) = pd.read_csv(undisturbed / DECISIONS).to_dict("records")
     assert row["verdict"] == "worse"
-    assert isinstance(row["mean difference"], float)
+    assert isinstance(row["mean clipped difference"], float)
     assert row["seeds"] < 48
     assert len(results.load_runs(undisturbed)) == 2 * row["seeds"]
     assert ResultsFolder(undisturbed).manifest["until_decided"]["runs"] == 2 * row["seeds"]

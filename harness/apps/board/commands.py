@@ -93,14 +93,16 @@ def verify(
 
         _print_findings(partial(check_submission, folder, rerun or SUBMITTED_RERUNS))
         return
+    codes = {}
+    for word in controller or []:
+        name, equals, place = word.partition("=")
+        if not equals:
+            raise ConfigurationError(f"--controller {word}: wanted NAME=FILE")
+        codes[name] = find_code(place)
     opened = ResultsFolder(folder)
     _check_files(opened)
     if rerun is None:
         return
-    codes = {}
-    for word in controller or []:
-        name, _, place = word.partition("=")
-        codes[name] = find_code(place)
     _print_findings(partial(recheck, opened, draw(opened.runs(), rerun), Given(codes)))
 
 

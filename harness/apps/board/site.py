@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from servobench.controllers.aids import describe_aids
 from servobench.harness.apps.board.protocol import KINDS, VERSION, worlds_of
-from servobench.harness.apps.board.submission import PACK, RUNS, TUNED, Submission
+from servobench.harness.apps.board.submission import RUNS, Submission
 from servobench.harness.apps.figures.responses import draw_moves
 from servobench.harness.apps.figures.style import (
     NARROW,
@@ -48,7 +48,7 @@ class Entry:
     key: str  # name of its folder within the site
     head: Submission
     order: str  # "2 of 3" where the author submitted the method several times
-    tuned: bool  # whether its pack, or this package, holds values tuned for it
+    tuned: bool  # whether it was judged with values tuned for it
     division: str  # with which aids
     folders: dict[str, ResultsFolder]  # by world
     scores: pd.DataFrame  # its own runs as the suite judges them, with the kind of their world
@@ -125,7 +125,8 @@ def _read_entry(key: str, head: Submission, folder: Path, order: str) -> Entry:
     scores = pd.concat(judged, ignore_index=True)
     scores = scores[scores["controller"] == head.method]
     kinds = scores["challenge"].map(KIND_OF)
-    tuned = bool(tuned_settings(head.method)) or any((folder / PACK).glob(f"*{TUNED}"))
+    # Values lie beside the code of other classes, or of an earlier state, too; the runs tell which were used.
+    tuned = bool(tuned_settings(head.method) or runs.manifest.get("tuned"))
     return Entry(key, head, order, tuned, division, opened, scores.assign(kind=kinds))
 
 

@@ -77,8 +77,8 @@ def tune(
     lost = [name for name, tuned in results.items() if tuned.lost]
     if len(results) > len(lost):
         say(
-            f"studies and tuned values in {out}; copy its .toml files to controllers/tuned; "
-            "those of your controllers lie beside their code and are taken from now on"
+            f"studies in {out}; tuned values of your controllers lie beside their code and are taken from now on, "
+            "those of servobench in its .toml files, for controllers/tuned"
         )
     if interrupt is not None:
         end_interrupted(f"finished points are kept in {out}", "the same call continues")

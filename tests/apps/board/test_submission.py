@@ -213,6 +213,9 @@ def test_a_second_submission_stands_beside_the_first(honest, copied, tmp_path):
     again = copied.rename(tmp_path / "again")
     entries = read_entries([again, honest])
     assert [each.order for each in entries.values()] == ["no. 1 of 2", "no. 2 of 2"]
+    # Nobody took these values: the runs were made without.
+    (again / PACK / "mine.Mine.tuned.toml").write_text("gain = 3.0\n")
+    assert [each.tuned for each in read_entries([again, honest]).values()] == [False, False]
     assert list(entries) == ["it", "again"]
     (table,) = rank(entries.values())
     assert [row.rank for row in table.rows] == [1, 1]

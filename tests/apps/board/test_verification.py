@@ -275,3 +275,6 @@ print("PermissionError" in subprocess.run([sys.executable, "-c", child], capture
 def test_code_without_runs_to_carry_out_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
     assert servobench(monkeypatch, "verify", "out", "--controller", "Mine=mine.py") == 2
     assert "give both" in capsys.readouterr().err
+    for_one = ("--rerun", "1", "--controller", "mine.py")
+    assert servobench(monkeypatch, "verify", "out", *for_one) == 2
+    assert "--controller mine.py: wanted NAME=FILE" in capsys.readouterr().err
