@@ -230,6 +230,6 @@ def _settings(changed: Mapping[str, Any] | None) -> str:
     if changed is None:
         return "All settings are in the file manifest.json of the results"
     if not changed:
-        return "All settings are the defaults of this version"
+        return "Settings that are not named are the defaults of this version"
     pairs = ", ".join(f"{key} = {value}" for key, value in changed.items())
     return f"Settings other than the defaults: {pairs}"

@@ -1,5 +1,7 @@
 """FMUs as controllers by a mapping: ours equal the originals, foreign ones close a loop, bad ones are refused."""
 
+from zipfile import ZipFile
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,11 @@ parameters = {gain = 1.5}
 
 @pytest.mark.parametrize(("name", "version"), [("ukf_mfac:published", 2), ("regression_mfac", 3)])
 def test_an_exported_controller_as_an_fmu_equals_the_original_in_every_step(name, version):
-    fmu = choose_controller(str(exported(name, version)))
+    archive = exported(name, version)
+    with ZipFile(archive) as opened:
+        page = opened.read("documentation/index.html").decode()
+    assert "robot = ur5\nsensing = position\n" in page
+    fmu = choose_controller(str(archive))
     native, plugged = (
         run(each, task="random", mismatch="moderate", seed=3, settings=SETTINGS)
         for each in (name, fmu)

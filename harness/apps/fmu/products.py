@@ -38,7 +38,7 @@ from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.catalogue import find_robot, short_name
 
 REFERENCE_PERIODS = 200  # most periods of the run inside the FMU
 TOLERANCE = 1e-9
@@ -82,6 +82,8 @@ def _model(
         sensing = resolved.request.sensing
         where = "" if sensing == DEFAULT_SENSING else f" with the sensing {sensing}"
         raise ConfigurationError(f"{name} has no exported form{where}: {error}") from error
+    request = resolved.request
+    facts = {"robot": short_name(request.robot), "sensing": request.sensing}
     return ControllerModel(
         name=entry.name,
         summary=entry.summary,
@@ -90,7 +92,7 @@ def _model(
         period=spec.period,
         run={each: rows[:kept] for each, rows in columns.items()},
         settings="\n".join(
-            f"{key} = {value}" for key, value in flatten(resolved.controller).items()
+            f"{key} = {value}" for key, value in (facts | flatten(resolved.controller)).items()
         ),
     )
 
