@@ -263,18 +263,22 @@ def toy_runs(words):
     ])  # fmt: skip
 
 
-def lay_out_suite(folder):
-    """Write the tables of a suite of one challenge with all methods that studies compare."""
+def lay_out_suite(folder, challenges):
+    """Write the tables of a suite with all methods that studies compare, alike in every challenge."""
     folder.mkdir()
     own = {
-        "challenge": "severe", "grade": "I", "measure": "settling", "reference": 0.7, "score": 0.5, "good.value": 99.0,
+        "grade": "I", "measure": "settling", "reference": 0.7, "score": 0.5, "good.value": 99.0,
         "median.value": 0.8, "median.low": 0.7, "median.high": 0.9, "median.count": 2,
     }  # fmt: skip
-    methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN, *worlds.LEARNED_BY))
-    pd.DataFrame([{**own, "controller": name} for name in methods]).to_csv(folder / "methods.csv")
+    methods = dict.fromkeys((*worlds.COMPARED, *worlds.FROZEN))
+    rows = [
+        {**own, "challenge": challenge, "controller": name}
+        for challenge, name in product(challenges, methods)
+    ]
+    pd.DataFrame(rows).to_csv(folder / "methods.csv")
     scores = [
-        {**own, "controller": name, "seed": seed, "score": score}
-        for name in methods
+        {**row, "seed": seed, "score": score}
+        for row in rows
         for seed, score in enumerate((0.4, 0.6))
     ]
     pd.DataFrame(scores).to_csv(folder / "scores.csv")
@@ -305,8 +309,10 @@ def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path
         for part in generated_tables.PART.findall(page.read_text())
     ]
     shown = {name for _, _, names, *_ in parts for name in names.partition(":")[0].split(",")}
-    for part in ("runs", *worlds.LEARNING.commands):
-        lay_out_suite(tmp_path / part)
+    lay_out_suite(tmp_path / "runs", set(worlds.LEARNED_IN) - set(worlds.UNGRADED))
+    lay_out_suite(tmp_path / "ungraded", worlds.UNGRADED)
+    for part in worlds.LEARNING.commands:
+        lay_out_suite(tmp_path / part, ["severe"])
     for study in (
         value
         for value in vars(module).values()
