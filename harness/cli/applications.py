@@ -2,13 +2,13 @@
 
 The core stands without the applications, and nothing in it imports one: the command line finds a command here by its
 name and imports no other. A further application is a folder of `harness/apps` with `commands.py`, and a section of
-`applications.toml`.
+`applications.json`.
 """
 
-import tomllib
+import json
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import typer
@@ -31,9 +31,10 @@ class Application(NamedTuple):
     """packages beside it that nothing else imports"""
 
 
-_FILE = files(__package__).joinpath("applications.toml")
+# JSON, as a help page does without the time to import a reader of TOML
+_FILE = Path(__file__).with_name("applications.json")
 APPLICATIONS = {
-    name: Application(**row) for name, row in tomllib.loads(_FILE.read_text("utf-8")).items()
+    name: Application(**row) for name, row in json.loads(_FILE.read_text("utf-8")).items()
 }
 CORE = {  # module of harness/cli -> its commands
     "runs": ("run", "compare", "sweep", "train", "merge"),

@@ -10,7 +10,7 @@ import tomllib
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -356,7 +356,7 @@ def _declared(column: str, summary: Any = None, **entry: Any) -> Metric:  # noqa
     return Metric(column, values=_VALUES.get(column), summary=summary, **entry)
 
 
-_TABLE = tomllib.loads(files(__package__).joinpath("metrics.toml").read_text(encoding="utf-8"))
+_TABLE = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text(encoding="utf-8"))
 BUILT_IN = {column: _declared(column, **entry) for column, entry in _TABLE.items()}
 """Every metric of this package by the name of its column, in the order of the table of runs."""
 METRICS: Mapping[str, Metric] = ChainMap(DECLARED, BUILT_IN)

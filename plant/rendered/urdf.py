@@ -315,14 +315,14 @@ def arm_tree(arm: SerialArm, described: Robot, payload: float = 0.0) -> ET.Eleme
             inertia = R @ inertia @ R.T
         link = add_link(robot, links[i + 1], mass[i], inertia, centre=centre, along=along)
         _draw_link(link, step, radius[i], aside[i])
-        add_joint(robot, f"{name}_joint", (links[i], links[i + 1]), origins[i], turns=True)
-    add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
+        add_joint(robot, name or "unnamed", (links[i], links[i + 1]), origins[i], turns=True)
+    add_joint(robot, "flange_mount", (links[-1], FLANGE_LINK), origins[-1], turns=False)
     # The flange has a plate and the stick that carries the ball.
     flange = add_link(robot, FLANGE_LINK, *LIGHT_PART)
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius[-1])
     draw_cylinder(flange, DARK_GREY, (0.0, 0.0, 0.0), arm.tool, 0.25 * ball_radius)
     tool = np.stack([arm.tool, np.zeros(3)])
-    add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), tool, turns=False)
+    add_joint(robot, "ball_mount", (FLANGE_LINK, BALL_LINK), tool, turns=False)
     ball_mass, ball_inertia = LIGHT_PART
     ball = add_link(robot, BALL_LINK, ball_mass + payload, ball_inertia)
     draw_mesh(ball, RED, BALL_MESH, ball_radius)
