@@ -86,7 +86,7 @@ def test_tuned_values_are_found_beside_the_code_and_taken_by_every_command(
     mine, output_of, no_figures, tmp_path
 ):
     told = output_of("tune", "--controllers", "./mine.py", *SMALL, "--trials", 4, "--out", "s")
-    assert "tuned values of your controllers lie beside their code and are taken from now on" in told
+    assert "of your controllers lie beside their code and are taken from now on" in told
     values = read_tuned(tmp_path / "mine.Mine.tuned.toml")
     assert values.second_score < values.second_score_of_defaults
     assert values.seeds == ("10000:10008", "15000:15008")
