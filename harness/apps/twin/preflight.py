@@ -41,7 +41,7 @@ PAIR_GAIN = 0.5  # [1]
 # A log cannot tell mistakes apart whose remedies leave at most this many times the least misfit.
 TIE_RATIO = 1.1  # [1]
 # [1] Share of the frames above which the others may be false ones, and no part of the log that does not fit.
-MOST = 0.8
+INLIER_SHARE = 0.8
 # The robot of a search is taken if it leaves less than this share of the squared residuals.
 SEARCH_GAIN = 0.8  # [1]
 SCREENED = 6  # number of remedies that are fitted, those with the least errors
@@ -146,7 +146,7 @@ def _above_noise(log: Log, robot: Identified) -> BoolArray:
 def _is_noise(log: Log, robot: Identified) -> bool:
     """Return whether residuals are not far above the noise, or small beside the motion, for most of the frames."""
     rest = _above_noise(log, robot) & (_shares(log, robot) > MIN_SHARE)
-    return bool(not rest.any() and robot.inliers.mean() > MOST)
+    return bool(not rest.any() and robot.inliers.mean() > INLIER_SHARE)
 
 
 def _explains_more(one: Identified, other: Identified) -> bool:

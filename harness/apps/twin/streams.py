@@ -230,7 +230,7 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 -
         yield name, value.sec + NANOSECOND * value.nanosec
     elif hasattr(value, "position") and hasattr(value, "name"):
         yield from _flat("header", value.header)
-        # Of some devices positions are empty.
+        # A gripper may tell names without positions.
         yield from zip(value.name, value.position.tolist(), strict=False)
     elif is_dataclass(value):
         for each in fields(value):
