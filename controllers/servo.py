@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast, final
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import Controller, Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial_jacobian import InitialJacobian
@@ -25,12 +26,14 @@ from servobench.controllers.stages.calibration import (
     Regressed,
 )
 from servobench.controllers.stages.estimation import REGRESSED, Estimation, EstimationState
-from servobench.controllers.stages.finish import Finish
+from servobench.controllers.stages.finish import Finish, scale_to_limit
 from servobench.controllers.stages.prediction import Predictor, PredictorState, shifted
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import BoolArray, Command, Observation
+
+HALF_WAY = np.array(1.0)  # [rad] from the present joint position at most
 
 
 class ServoState(NamedTuple):
@@ -42,7 +45,7 @@ class ServoState(NamedTuple):
     predictor: Any  # state of the predict stage; None without one
     ready: BoolArray  # (...), whether the initial Jacobian is known
     limited: BoolArray  # (...), whether the last command was limited
-    calibration: CalibrationState | None  # state of the calibrating stage; None without one
+    calibration: Any  # state of the calibrating stage; None without one
 
     @property
     def jacobian(self) -> FloatArray:
@@ -106,9 +109,9 @@ class Servo:
         self.initial = initial
         self.estimation = Estimation(estimator, knowledge, aids, delays)
         self.predictor = Predictor(aids, knowledge.spec.period, delays) if predicts else None
-        self.calibration = _calibration(aids, knowledge, predicts=predicts)
+        self.calibration: Any = _calibration(aids, knowledge, predicts=predicts)
         self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
-        self._feeds_forward = aids.feedforward
+        self._aids = aids
         self._turns = law.in_model_frame and aids.model in REGRESSED
         # Feedforward needs the row of the next instant, too.
         self._rows = 1 + int(aids.feedforward)
@@ -153,9 +156,8 @@ class Servo:
 
     def _arm_jacobian(self, _: FloatArray, calibration: CalibrationState) -> FloatArray:
         """Return the Jacobian of the calibrated arm, (..., m, n), in lanes where it is believed."""
-        if self.calibration is None:
-            raise ValueError("aids: there is no calibrating stage")
-        return self.calibration.jacobian(calibration)
+        jacobian: FloatArray = self.calibration.jacobian(calibration)
+        return jacobian
 
     def _natural(self, observation: Observation) -> Observation:
         return observation.with_values(observation.joint_position, observation.feature / self._unit)
@@ -216,11 +218,12 @@ class Servo:
                     calibration,
                     ahead.joint_position,
                     lead,
+                    later[..., 0, :],
                 )
                 ahead = ahead.with_values(ahead.joint_position, seen.feature)
                 J = seen.jacobian
                 drift = seen.drift
-                if not self._feeds_forward:
+                if not self._aids.feedforward:
                     # A law with a preview of its own sees the reference move against the drift.
                     periods = np.arange(self._rows)[:, None]
                     later = later - periods * drift[..., None, :]
@@ -231,7 +234,7 @@ class Servo:
                 f"{J.tolist()}"
             )
         forward: FloatArray = np.zeros(())
-        if self._feeds_forward:
+        if self._aids.feedforward:
             forward = later[..., 1, :] - later[..., 0, :] - drift
         u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
         u = self.law.restrained(law, wanted, u)
@@ -251,19 +254,19 @@ class Servo:
         observation: Observation,
     ) -> CalibrationState:
         """Return the state of the calibrating stage at an observation."""
-        pairing = self.estimation.pairing
-        if self.calibration is None or pairing is None or state.calibration is None:
-            raise ValueError("aids: model='arm' needs the pair stage")
         pair = estimation.learned.pair
         due = np.equal(estimation.last.time, observation.time)
         regression = Regressed(
             feature=predictor.feature,
             jacobian=estimation.jacobian,
-            delay=pairing.delay(pair) * self.knowledge.spec.period,
+            delay=self.estimation.pairing.delay(pair) * self.knowledge.spec.period,
             deviation=pair.noise.deviation,
             moves=pair.regression.moves,
         )
-        return self.calibration.update(state.calibration, observation, due, regression, pair.late)
+        new: CalibrationState = self.calibration.update(
+            state.calibration, observation, due, regression, pair.late
+        )
+        return new
 
     def _believed(
         self,
@@ -271,11 +274,21 @@ class Servo:
         calibration: CalibrationState,
         bound: FloatArray,
         lead: FloatArray,
+        target: FloatArray,
     ) -> Ahead:
-        """Return the prediction of the calibrated arm in lanes where it is believed."""
-        if self.calibration is None:
-            raise ValueError("aids: there is no calibrating stage")
-        return self.calibration.ahead(calibration, bound, lead)
+        """Return the prediction of the calibrated arm in lanes where it is believed, its Jacobian half-way to a target.
+
+        By the Jacobian of the middle a step to the target (..., m) errs by its cube, by that of its begin by its
+        square: second-order minimisation as in Malis (ICRA 2004), who takes the mean of both ends. An estimate that
+        is good near what was seen gains nothing from it, nor does a law that plans its way.
+        """
+        ahead: Ahead = self.calibration.ahead(calibration, bound, lead)
+        if "preview" in self.law.owns:
+            return ahead
+        inverse = damped_inverse(ahead.jacobian, self._aids.damping)
+        half = 0.5 * np.matvec(inverse, target - ahead.feature)
+        middle = bound + scale_to_limit(half, HALF_WAY)
+        return ahead._replace(jacobian=self.calibration.ahead(calibration, middle, lead).jacobian)
 
     def _command(
         self,
@@ -304,7 +317,7 @@ class Servo:
         own: dict[str, Any] = {"probing": 1.0 - state.ready, "saturated": state.limited}
         if self.predictor is not None:
             own["lead"] = state.predictor.response.lead * self.knowledge.spec.period
-        if self.calibration is not None and state.calibration is not None:
+        if self.calibration is not None:
             own.update(self.calibration.diagnostics(state.calibration))
         estimation = self.estimation.diagnostics(state.estimation)
         if not np.any(state.ready):

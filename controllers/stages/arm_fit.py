@@ -300,20 +300,18 @@ class Fit:
         self._play = names.index("play")
         self._ripple = names.index("ripple")
         self.count = len(names)
-        self._cores = np.full(len(names), np.inf)
-        self._largest = np.full(len(names), np.inf)
-        self._spreads = np.zeros((4, len(names)))
-        for index, name in enumerate(names):
-            kind = name.partition("_")[0]
-            self._cores[index] = CORES.get(kind, np.inf)
-            self._largest[index] = LARGEST.get(kind, np.inf)
-            self._spreads[:, index] = SPREADS.get(kind, (0.0,) * 4)
+        kinds = [name.partition("_")[0] for name in names]
+        self._cores = np.array([CORES.get(kind, np.inf) for kind in kinds])
+        self._largest = np.array([LARGEST.get(kind, np.inf) for kind in kinds])
+        spreads = [SPREADS.get(kind, (0.0,) * 4) for kind in kinds]
+        self._spreads = np.stack(spreads, axis=1)
         self._turns = [index for index, name in enumerate(names) if "turn_" in name]
         places = range(model.pose_columns.start, len(model.names))
         self._places = [index for index in places if index not in self._turns]
         self._zeros = model.columns("zero_")
         self.first_turn = names.index("camera_turn_z")
-        self._least = np.where([name == "play" for name in names], 0.0, -self._largest)
+        self._least = -self._largest
+        self._least[self._play] = 0.0
         # Where members begin, in shares of their spreads; the same in every run.
         generator = np.random.default_rng(12345)
         self._draws = generator.uniform(-1.0, 1.0, (DRAWS, len(names)))

@@ -79,7 +79,7 @@ class Estimation:
         # Half a period keeps rounding of times out of the comparison with a motion's duration.
         self._shortest = (max(1, whole_periods(MOTION_TIME, period)) - 0.5) * period
         self._longest = math.inf
-        self.pairing: Pairing | None = None
+        self.pairing: Any = None
         if aids.needs_past:
             self.pairing = Pairing(aids, knowledge, delays.latency)
             self._longest = (self.pairing.gap + 0.5) * period
@@ -180,7 +180,7 @@ class Estimation:
         own = np.matvec(state.own, joint_step)
         if self._model == "nominal":
             return predicted + own
-        if self._model == "own" or self.pairing is None:
+        if self._model == "own":
             return np.asarray(own)
         regression = self.pairing.regression
         h = regression.regressors(begin + 0.5 * joint_step, joint_step, predicted)
@@ -207,7 +207,7 @@ class Estimation:
         self, own: FloatArray, learned: Learned, joint_position: FloatArray, nominal: FloatArray
     ) -> FloatArray:
         """Return Ĵ at joint positions, (..., m, n), for the estimator's own part and J_n there."""
-        if self._model == "own" or self.pairing is None:
+        if self._model == "own":
             return own
         if self._model in REGRESSED:
             nominal = self.pairing.regression.jacobian(

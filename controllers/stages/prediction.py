@@ -271,8 +271,6 @@ class Predictor:
             estimation: their state of this period.
             observation: of this period.
         """
-        if stages.pairing is None:
-            raise ValueError("aids: a stage that predicts needs the pair stage")
         q = observation.joint_position
         past = stages.pairing.past(estimation.learned.pair, observation, self.window)
 

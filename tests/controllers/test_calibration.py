@@ -14,6 +14,8 @@ from servobench.controllers.stages.arm_fit import Fit
 from servobench.harness.apps.fmu.products import controller_model
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out
+from servobench.harness.run.experiment import build
+from servobench.harness.run.loop import begin, careful, periods
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import ConfigurationError
@@ -126,7 +128,7 @@ def test_with_stamps_the_latency_of_frames_is_found_though_it_swings():
             "kinematic": {"sensing": {**swing, "stamps": stamps, "clock_offset": 40.0}},
             "random": {"duration": 4.0},
         }
-        found.append(carry_out(run("moderate", settings=settings, task="random")).steps.iloc[-1])
+        found.append(carry_out(run("moderate", 4, settings=settings, task="random")).steps.iloc[-1])
     bare, stamped = found
     assert bare["diagnostic_lateness"] > 0.02
     assert stamped["diagnostic_lateness"] == 0.0
@@ -203,3 +205,45 @@ def test_the_jacobian_is_that_of_the_true_arm_after_a_lap():
     assert steps["diagnostic_calibrated"].iloc[-1] == 1.0
     # The regression alone is wrong by a quarter here.
     assert steps["jacobian_error"].iloc[-1] < 0.02
+
+
+def test_an_arm_that_is_believed_steps_by_its_jacobian_half_way_to_the_target():
+    """A step errs by the cube of its length, by the Jacobian of where it begins by its square."""
+    experiment = build(run(task="random"))
+    controller = experiment.controller
+    rollout = begin(experiment.plant, controller, experiment.desired(), experiment.loop, (1, 2))
+    with careful():
+        for period in periods(rollout, controller):
+            if period.observation.time > 3.0:
+                break
+    servo = controller.servo
+    calibration = controller.state.calibration
+    assert calibration.used
+    commanded = []
+    command = servo.law.command
+
+    def noted(state, estimate, observation, reference):
+        commanded.append((estimate.jacobian, observation.joint_position, reference[0]))
+        return command(state, estimate, observation, reference)
+
+    servo.law.command = noted
+    errors = []
+    for size in (0.08, 0.04):
+        target = period.observation.feature + size * np.array([0.6, -0.64, 0.48])
+        reference = np.tile(target, (1 + servo.knowledge.preview, 1))
+        stepped = servo.step(controller.state, period.observation, reference)
+        J, q, wanted = commanded[-1]
+
+        def after(jacobian, q=q, wanted=wanted, calibration=stepped.state.calibration):
+            here = servo.calibration.ahead(calibration, q, np.zeros(()))
+            step = np.linalg.pinv(here.jacobian if jacobian is None else jacobian) @ (
+                wanted - here.feature
+            )
+            there = servo.calibration.ahead(calibration, q + step, np.zeros(()))
+            return np.linalg.norm(there.feature - wanted)
+
+        errors.append((after(J), after(None)))
+    (far, wide), (near, narrow) = errors
+    assert wide / narrow == pytest.approx(4.0, rel=0.2)
+    assert far / near == pytest.approx(8.0, rel=0.2)
+    assert far < 0.1 * wide
