@@ -29,7 +29,7 @@ from servobench.harness.batch.trials import choose
 from servobench.harness.config.description import toml
 from servobench.harness.config.installation import installed_version
 from servobench.harness.config.registry import find_controller, is_foreign_controller, offering
-from servobench.harness.config.source import make_importable, neighbours
+from servobench.harness.config.source import code_digest, make_importable, neighbours
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import read_toml, writing_together
 from servobench.plant.contract.settings import Names, override, settings
@@ -142,7 +142,11 @@ def fill_pack(given: str, folder: Path) -> Submission:
     files = [file]
     if file.suffix != WHEEL:
         files += neighbours(file, file.parent)
-        files += file.parent.glob(f"{file.stem}.*{TUNED}")
+        own = code_digest(file)
+        for tuned in file.parent.glob(f"{file.stem}.*{TUNED}"):
+            # Values that were tuned for other code are not used.
+            if read_toml("tuned values", tuned).get("sha256") == own:
+                files.append(tuned)
     for each in files:
         target = folder / each.relative_to(file.parent)
         target.parent.mkdir(parents=True, exist_ok=True)

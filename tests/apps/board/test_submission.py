@@ -17,11 +17,18 @@ from servobench.harness.apps.board import protocol
 from servobench.harness.apps.board.examination import check_submission
 from servobench.harness.apps.board.protocol import CLAUSES, COLUMNS
 from servobench.harness.apps.board.site import rank, read_entries, write_site
-from servobench.harness.apps.board.submission import PACK, RUNS, Submission, submit
+from servobench.harness.apps.board.submission import (
+    PACK,
+    RUNS,
+    Submission,
+    fill_pack,
+    submit,
+)
 from servobench.harness.batch.campaign import Execution
 from servobench.harness.batch.results import RUNS as TABLE
 from servobench.harness.batch.schema import MANIFEST
 from servobench.harness.config.registry import offering
+from servobench.harness.config.source import code_digest
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -146,6 +153,17 @@ def test_tuned_values_are_of_tuning_robots_and_of_the_code(copied, seeds, code, 
     text = f'seeds = ["{seeds}"]\nsha256 = "{code}"\nbudget = "9 trials"\n[settings]\n'
     (copied / PACK / "mine.Mine.tuned.toml").write_text(text)
     assert clause in {each.clause for each in broken(copied)}
+
+
+def test_values_that_were_tuned_for_other_code_are_not_packed(tmp_path):
+    write(tmp_path, STEPPING)
+    code = {"Mine": code_digest(tmp_path / "mine.py"), "Other": "0" * 64}
+    for name, sha256 in code.items():
+        (tmp_path / f"mine.{name}.tuned.toml").write_text(f'sha256 = "{sha256}"\n')
+    pack = tmp_path / "pack"
+    pack.mkdir()
+    fill_pack(str(tmp_path / "mine.py"), pack)
+    assert [each.name for each in pack.glob("*.toml")] == ["mine.Mine.tuned.toml"]
 
 
 def test_code_that_names_the_bench_is_found_without_running_it(copied):
