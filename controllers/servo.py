@@ -30,10 +30,11 @@ from servobench.controllers.stages.finish import Finish, scale_to_limit
 from servobench.controllers.stages.prediction import Predictor, PredictorState, shifted
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import ControllerDiverged
-from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.signals import BoolArray, Command, Observation
 
 HALF_WAY = np.array(1.0)  # [rad] from the present joint position at most
+NEAR = 0.02  # [rad] of all joints, below which the Jacobian half-way is that of the present joint position
 
 
 class ServoState(NamedTuple):
@@ -288,7 +289,15 @@ class Servo:
         inverse = damped_inverse(ahead.jacobian, self._aids.damping)
         half = 0.5 * np.matvec(inverse, target - ahead.feature)
         middle = bound + scale_to_limit(half, HALF_WAY)
-        return ahead._replace(jacobian=self.calibration.ahead(calibration, middle, lead).jacobian)
+        # On curves the target is near, and a second look at the arm would cost as much as the first one for nothing.
+        return branch(norm(half) > NEAR, self._half_way, ahead, calibration, middle, lead)
+
+    def _half_way(
+        self, ahead: Ahead, calibration: CalibrationState, middle: FloatArray, lead: FloatArray
+    ) -> Ahead:
+        """Return a prediction with the Jacobian of other joint positions, (..., n)."""
+        there: Ahead = self.calibration.ahead(calibration, middle, lead)
+        return ahead._replace(jacobian=there.jacobian)
 
     def _command(
         self,
