@@ -33,8 +33,8 @@ from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.signals import BoolArray, Command, Observation
 
-HALF_WAY = np.array(1.0)  # [rad] from the present joint position at most
-NEAR = 0.02  # [rad] of all joints, below which the Jacobian half-way is that of the present joint position
+REACH = np.array(1.0)  # [rad] by which a joint half-way may differ from the present one
+NEAR = 0.02  # [rad] length of half the way, up to which the present Jacobian serves
 
 
 class ServoState(NamedTuple):
@@ -277,18 +277,18 @@ class Servo:
         lead: FloatArray,
         target: FloatArray,
     ) -> Ahead:
-        """Return the prediction of the calibrated arm in lanes where it is believed, its Jacobian half-way to a target.
+        """Return the prediction of the calibrated arm in lanes where it is believed.
 
-        By the Jacobian of the middle a step to the target (..., m) errs by its cube, by that of its begin by its
-        square: second-order minimisation as in Malis (ICRA 2004), who takes the mean of both ends. An estimate that
-        is good near what was seen gains nothing from it, nor does a law that plans its way.
+        Its Jacobian is that half-way to the target, (..., m): with it the error of a step grows with the cube of the
+        way, with the present one with its square. Malis (ICRA 2004) takes the mean of both ends instead. A law that
+        plans its way gains nothing from it and gets the present Jacobian.
         """
         ahead: Ahead = self.calibration.ahead(calibration, bound, lead)
         if "preview" in self.law.owns:
             return ahead
         inverse = damped_inverse(ahead.jacobian, self._aids.damping)
         half = 0.5 * np.matvec(inverse, target - ahead.feature)
-        middle = bound + scale_to_limit(half, HALF_WAY)
+        middle = bound + scale_to_limit(half, REACH)
         # On curves the target is near, and a second look at the arm would cost as much as the first one for nothing.
         return branch(norm(half) > NEAR, self._half_way, ahead, calibration, middle, lead)
 
