@@ -98,9 +98,16 @@ class UR(servobench.Plant):
         self.k, self.seen, self.shown, self.stamp, self.before = -1, False, -1.0, -1.0, None
         self.receive = RTDEReceiveInterface(self.config.host)
         self.control = None if self.config.dry_run else RTDEControlInterface(self.config.host)
+        # The program is heard of by two connections: this one may be the later
+        due = time.monotonic() + 1.0
+        while self.control and not self.running() and time.monotonic() < due:
+            time.sleep(0.002)
         # Or a ColourBall before your camera
         self.detector = Served(self.config.host, self.patience)
         return self.observe()
+
+    def running(self):
+        return bool(self.receive.getRobotStatus() & 2)
 
     def observe(self):
         faulthandler.dump_traceback_later(2.0 + self.patience, exit=True)
@@ -116,9 +123,8 @@ class UR(servobench.Plant):
         alive = stamp > self.stamp and all(
             each.isConnected() for each in (self.receive, self.control) if each
         )
-        if not alive or (
-            self.control and not self.receive.getRobotStatus() & 2
-        ):  # a `true` of a call proves nothing
+        # A `true` of a call proves nothing
+        if not alive or (self.control and not self.running()):
             raise RuntimeError(
                 "the control program has ended" if alive else "the robot cannot be heard any more"
             )

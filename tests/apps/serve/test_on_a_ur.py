@@ -4,11 +4,13 @@ import os
 import re
 import runpy
 import signal
+import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ import pytest
 import servobench
 from kit.command import PACKAGE, start
 from kit.documents import ROOT
-from kit.served import fresh_address, served, waited_for
+from kit.served import connected, fresh_address, served, waited_for
+from servobench.harness.apps.serve.server import PORTS
 from servobench.plant.robot.camera import CAMERA
 
 pytestmark = pytest.mark.skipif(
@@ -94,6 +97,58 @@ def test_in_lockstep_rows_and_commands_are_those_of_a_run(tmp_path):
     rows = numbers(servobench.load(tmp_path / "served").steps)
     assert rows.shape == (40, 20)
     assert np.array_equal(rows, numbers(run.steps))
+
+
+def hang_up(end):
+    """Close a socket, such that a thread that waits at it goes on."""
+    with suppress(OSError):
+        end.shutdown(socket.SHUT_RDWR)
+    end.close()
+
+
+@contextmanager
+def forwarded(address, delay):
+    """Yield an address that stands for another one; what its first client of RTDE hears comes later by a delay [s]."""
+    own = fresh_address()
+    delays = {"RTDE": iter([delay])}
+
+    def pump(source, sink, delay):
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                time.sleep(delay)
+                sink.sendall(data)
+        hang_up(sink)
+
+    def accept(listener, port):
+        with suppress(OSError):
+            while True:
+                near, _ = listener.accept()
+                far = connected(address, port)
+                far.settimeout(None)
+                stack.callback(hang_up, near)
+                stack.callback(hang_up, far)
+                late = next(delays.get(port, iter(())), 0.0)
+                Thread(target=pump, args=(near, far, 0.0), daemon=True).start()
+                Thread(target=pump, args=(far, near, late), daemon=True).start()
+
+    with ExitStack() as stack:
+        for port, number in PORTS.items():
+            listener = socket.create_server((own, number))
+            stack.callback(hang_up, listener)
+            Thread(target=accept, args=(listener, port), daemon=True).start()
+        yield own
+
+
+@pytest.mark.slow
+def test_a_run_begins_where_its_second_connection_is_the_later_one(tmp_path):
+    """The control program runs by one connection, and by the other one not yet."""
+    short = ("--set", "target.duration=1.0")
+    with (
+        served(settings={"target": {"duration": 1.0}}) as (_, address, _),
+        forwarded(address, 0.1) as late,
+    ):
+        code, said = finished(on_a_ur(late, tmp_path / "late", *WIDE, *short))
+    assert code == 0, said
 
 
 @pytest.mark.slow
