@@ -22,8 +22,8 @@ last ones and the first ones, and of others a set that is thinned evenly.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, final
+from functools import cache
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -78,9 +78,10 @@ DAMPING_FACTORS = (0.2, 8.0)  # [1] of λ after a step that is made, and one tha
 DAMPINGS = (1e-6, 1e4)  # [1] between which λ lies
 ANNEALED = 6  # iterations in which the noise of new members falls to its true size
 MAX_ZERO_STEP = 0.7  # [rad] largest change of a zero in an iteration
-# Rows that a spline needs, counted from the last one before an instant
-SUPPORT = np.array([-1, 0, 1, 2])
-ROWS = ("time", "feature", "weight", "path")  # the arrays of `Frames` with a row a frame
+CATMULL_ROM = 0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]])
+"""Weights of four rows by 1, u, u² and u³ (4 × 4), at a share u of the interval between the two in the middle."""
+# The arrays of `Frames` with a row a frame, and which axis that is
+ROWS = {"time": -1, "feature": -2, "weight": -2, "path": -2}
 
 
 class Frames(NamedTuple):
@@ -89,7 +90,7 @@ class Frames(NamedTuple):
     time: FloatArray  # (..., F) [s] since the start
     feature: FloatArray  # (..., F, m), in natural units
     weight: FloatArray  # (..., F, m), 1 for a valid feature, 0 for none
-    # (..., F, J, 2n): joint positions [rad] up to the frame and x, `GRID` apart, the newest last
+    # (..., J, F, 2n): joint positions [rad] up to the frame and x, `GRID` apart, the newest last
     path: FloatArray
     number: IntArray  # (...), how many there are
 
@@ -140,50 +141,57 @@ class Fitted(NamedTuple):
     motion: FloatArray  # ẏ, (..., E, m, F), 1/s
 
 
+@cache
+def _splines(count: int) -> FloatArray:
+    """Return the weights of J rows by 1, u, u² and u³ in each interval between two of them, (J − 1, 4, J).
+
+    The rows that are missing at the ends lie on the lines through the last two.
+    """
+    rows = np.eye(count)
+    before = 2.0 * rows[:1] - rows[1:2]
+    after = 2.0 * rows[-1:] - rows[-2:-1]
+    longer = np.concatenate([before, rows, after])
+    return np.stack([CATMULL_ROM @ longer[k : k + 4] for k in range(count - 1)])
+
+
 def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatArray, FloatArray]:
     """Return joint positions and velocities a delay before each frame, by Catmull-Rom splines.
 
     Args:
-        path: (..., F, J, k) [rad].
+        path: (..., J, F, k) [rad].
         delay: (..., E) [s].
         grid: [s] between rows.
 
     Returns:
         (..., E, F, k) [rad], and [rad/s].
     """
-    last = path.shape[-2] - 1
-    x = np.clip(last - delay / grid, 0.0, last)
+    *lead, count, frames, width = path.shape
+    last = count - 1
+    x = np.minimum(np.maximum(last - delay / grid, 0.0), last)
     first = np.minimum(x.astype(np.int_), last - 1)
-    # A spline is a sum of four rows. Their weights are the splines of unit vectors, the same for all frames.
-    before, begin, end, after = np.eye(4)
-    slope_begin = 0.5 * (end - before)
-    slope_end = 0.5 * (after - begin)
-    # At the ends of the path the slope is that of the last interval.
-    slope_end = np.where((first + 2 > last)[..., None], end - begin, slope_end)
-    slope_begin = np.where((first == 0)[..., None], end - begin, slope_begin)
-    u = (x - first)[..., None]
-    cubic = 2.0 * begin - 2.0 * end + slope_begin + slope_end
-    square = 3.0 * (end - begin) - 2.0 * slope_begin - slope_end
-    position = ((cubic * u + square) * u + slope_begin) * u + begin
-    slope = (3.0 * cubic * u + 2.0 * square) * u + slope_begin
-    weights = np.stack([position, slope / grid], axis=-2)
-    rows = np.moveaxis(path, -2, delay.ndim - 1)
-    support = pick(rows, np.clip(first[..., None] + SUPPORT, 0, last), axes=2)
-    found = weights @ support.reshape(*support.shape[:-2], -1)
-    both = found.reshape(*found.shape[:-1], *support.shape[-2:])
-    return both[..., 0, :, :], both[..., 1, :, :]
-
-
-def each_row(frames: Frames, function: Callable[[FloatArray], FloatArray]) -> Frames:
-    """Return the buffer with a function applied to its arrays of rows."""
-    rows: dict[str, Any] = {name: function(getattr(frames, name)) for name in ROWS}
-    return frames._replace(**rows)
+    u = x - first
+    one = np.ones_like(u)
+    none = np.zeros_like(u)
+    position = [one, u, u * u, u * u * u]
+    velocity = [none, one, 2.0 * u, 3.0 * u * u]
+    powers = np.stack([*position, *velocity], axis=-1).reshape(*u.shape, 2, 4)
+    # The weights are the same for all frames: those of all members are one factor of a product.
+    weights = powers @ _splines(count)[first]
+    found = weights.reshape(*lead, -1, count) @ path.reshape(*lead, count, -1)
+    both = found.reshape(*u.shape, 2, frames, width)
+    return both[..., 0, :, :], both[..., 1, :, :] / grid
 
 
 def _moved_up(frames: Frames, behind: FloatArray | IntArray | BoolArray) -> Frames:
     """Return the buffer in which each row holds that of so many rows behind it, (..., F or 1)."""
     kept = np.minimum(np.arange(FRAMES) + behind, FRAMES - 1)
-    return each_row(frames, lambda array: pick(array, kept, axes=1))
+    paths = np.broadcast_to(kept[..., None, :], frames.path.shape[:-1])
+    return frames._replace(
+        time=pick(frames.time, kept, axes=1),
+        feature=pick(frames.feature, kept, axes=1),
+        weight=pick(frames.weight, kept, axes=1),
+        path=pick(frames.path, paths, axes=1),
+    )
 
 
 def _thinned(frames: Frames) -> Frames:
@@ -206,22 +214,22 @@ def added(
 ) -> Frames:
     """Return the buffer with one more frame, of `path` (..., J, 2n), for an old one where it holds `most` (...)."""
     frames = branch(frames.number >= most, _thinned, frames)
-    here = np.arange(FRAMES) == frames.number[..., None]
     new = {"time": time, "feature": feature, "weight": valid.astype(np.float64), "path": path}
     rows = {}
-    for name in ROWS:
-        old: FloatArray = getattr(frames, name)
-        mask = here.reshape(here.shape + (1,) * (old.ndim - here.ndim))
-        value = np.expand_dims(new[name], here.ndim - 1)
-        rows[name] = np.where(mask, value, old)
+    number = frames.number
+    for name, axis in ROWS.items():
+        array: FloatArray = getattr(frames, name).copy()
+        index = number.reshape(number.shape + (1,) * (array.ndim - number.ndim))
+        np.put_along_axis(array, index, np.expand_dims(new[name], axis), axis=axis)
+        rows[name] = array
     return frames._replace(**rows, number=frames.number + 1)
 
 
 def first(frames: Frames, most: int) -> Frames:
     """Return the buffer with `most` rows at most, a number that does not depend on other lanes."""
     kept = range(min(most, FRAMES))
-    axis = frames.time.ndim - 1
-    return each_row(frames, lambda array: array.take(kept, axis=axis))
+    rows = {name: getattr(frames, name).take(kept, axis=axis) for name, axis in ROWS.items()}
+    return frames._replace(**rows)
 
 
 def last(frames: Frames, most: int) -> Frames:
@@ -241,7 +249,7 @@ def whitened(
     Args:
         fitted: of members.
         lateness: s, (...) [s].
-        variance: σ², (..., E).
+        variance: σ², (..., E or 1).
     """
     bare = (fitted.residual, fitted.rates)
     return branch(lateness > 0.0, _whitened, bare, fitted.motion, lateness, variance)
@@ -276,6 +284,12 @@ def _along(by_joint: FloatArray, motion: FloatArray) -> FloatArray:
 def without_rates(fitted: Fitted) -> Fitted:
     """Return residuals alone."""
     return fitted._replace(rates=fitted.rates[..., :0, :, :])
+
+
+def _halves(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return q and x, (..., n) each, of rows (..., 2n); `np.split` takes twenty times as long."""
+    n = rows.shape[-1] // 2
+    return rows[..., :n], rows[..., n:]
 
 
 def squared(vectors: FloatArray) -> FloatArray:
@@ -384,7 +398,7 @@ class Fit:
         Args:
             members: (..., E).
             frames: which they are to fit.
-            variance: σ² of the comparison, (..., E).
+            variance: σ² of the comparison, (..., E or 1).
             count: how many are returned.
         """
         members, residual = self.aligned(members, frames)
@@ -421,24 +435,23 @@ class Fit:
             lateness: s, (...) [s].
             floor: σ² of residuals that are but noise, (..., 1).
         """
-        least = np.broadcast_to(floor, members.variance.shape)
         made = made[..., None]
-        larger = np.maximum(least, 0.25**made * members.variance)
-        variance = np.where(made < ANNEALED - 1, larger, least)
+        larger = np.maximum(floor, 0.25**made * members.variance)
+        variance = np.where(made < ANNEALED - 1, larger, floor)
         members, _ = self.iterated(members, frames, lateness, variance)
         return members
 
     def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
-        """Return joints behind gears at the exposures of frames with paths (..., F, J, 2n), and their velocities."""
+        """Return joints behind gears at the exposures of frames with paths (..., J, F, 2n), and their velocities."""
         row, rate = at_latency(path, members.latency, self.grid)
         q = self.geared(members, row)
-        velocity, place_rate = np.split(rate, 2, axis=-1)
+        velocity, place_rate = _halves(rate)
         play = members.theta[..., self._play, None, None]
         return q, q.slope * velocity + play * place_rate
 
     def geared(self, members: Members, row: FloatArray) -> Geared:
         """Return joints behind gears for reported ones and x, (..., E, F, 2n)."""
-        q, x = np.split(row, 2, axis=-1)
+        q, x = _halves(row)
         play = members.theta[..., self._play, None, None]
         ripple = members.theta[..., self._ripple, None, None]
         order = members.order[..., None, None]
@@ -454,7 +467,7 @@ class Fit:
 
         The play is the mean of the members', by their weights `share` (..., E).
         """
-        before, x = np.split(row, 2, axis=-1)
+        before, x = _halves(row)
         play = np.vecdot(share, members.theta[..., self._play])
         size = np.maximum(play, ASSUMED_PLAY)[..., None]
         after = np.clip(x - (q - before) / size, -1.0, 1.0)
@@ -603,7 +616,8 @@ class Fit:
     def moved(self, members: Members, step: FloatArray) -> Members:
         """Return members after a step (..., E, P + 2), within bounds."""
         own = step[..., : self.count]
-        later, turning = np.moveaxis(step[..., self.count :], -1, 0)
+        later = step[..., -2]
+        turning = step[..., -1]
         theta = members.theta + own
         before = members.theta[..., self._model]
         increment = own[..., self._model]

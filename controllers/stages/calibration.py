@@ -181,7 +181,7 @@ class Calibration:
         rows = (*lead, FRAMES)
         features = np.zeros((*rows, m))
         row = np.concatenate([q, np.zeros_like(q)], axis=-1)
-        paths = np.zeros((*rows, fit.rows, row.shape[-1]))
+        paths = np.zeros((*lead, fit.rows, FRAMES, row.shape[-1]))
         frames = Frames(np.zeros(rows), features, features, paths, number=zero)
         members = fit.start(lead, FIRST_MEMBERS, none)
         size = (*lead, FIRST_MEMBERS)
@@ -325,7 +325,7 @@ class Calibration:
     def _searched(self, state: CalibrationState, noise: FloatArray) -> CalibrationState:
         """Return the state after a further iteration of all members."""
         frames = self._in_use(state)
-        variance = np.broadcast_to(_floor(noise), state.share.shape)
+        variance = _floor(noise)
         members, _ = self.fit.iterated(state.members, frames, state.lateness, variance)
         return state._replace(members=members)
 
@@ -374,7 +374,7 @@ class Calibration:
     def _continued(self, state: CalibrationState, noise: FloatArray) -> CalibrationState:
         """Return the state after an iteration, with weights, biases and the noise of frames that members imply."""
         frames = self._in_use(state)
-        variance = np.broadcast_to(_floor(noise), state.share.shape)
+        variance = _floor(noise)
         members, fitted = self.fit.iterated(state.members, frames, state.lateness, variance)
         cost = members.cost
         best = cost.argmin(axis=-1)
@@ -461,7 +461,7 @@ class Calibration:
         known = past[0]
         fit = self.fit
         members = known.members
-        q, _ = fit.exposed(members, path[..., None, :, :])
+        q, _ = fit.exposed(members, path[..., None, :])
         turn = (members.turning * instant[..., None])[..., None]
         found = fit.feature(members, q, turn)
         seen = found[..., 0, :] / fit.scale
@@ -485,7 +485,7 @@ class Calibration:
 
     def _exposed(self, path: FloatArray, delay: FloatArray) -> FloatArray:
         """Return joint positions, (..., n) [rad], a delay (...) [s] before the end of a path (..., J, 2n)."""
-        exposed, _ = at_latency(path[..., None, :, :], delay[..., None], self.fit.grid)
+        exposed, _ = at_latency(path[..., None, :], delay[..., None], self.fit.grid)
         return self._joints(exposed[..., 0, 0, :])
 
     def _trusted(self, state: CalibrationState) -> BoolArray:
@@ -509,7 +509,7 @@ class Calibration:
         count = math.ceil(min(max(most, CANDIDATES), SCREENED) / parts)
         better = math.ceil(CANDIDATES / parts)
         new = self.fit.spawned(state.travel.shape, state.spawned, count, delay)
-        coarse = np.broadcast_to(SCREENING * _floor(noise), new.cost.shape)
+        coarse = SCREENING * _floor(noise)
         new = self.fit.screened(new, self._in_use(state), coarse, better)
         kept = self._reduced(state, state.share.shape[-1] - better)
         return self._together(kept._replace(spawned=state.spawned + count), new)
@@ -584,7 +584,7 @@ class Calibration:
         jacobian = by_joint[..., 0, :, :] / fit.scale
         return Ahead(
             feature=np.vecmat(state.share, feature + state.bias),
-            jacobian=np.vecmat(state.share[..., None, :], np.moveaxis(jacobian, -3, -2)),
+            jacobian=np.vecmat(state.share[..., None, :], np.swapaxes(jacobian, -3, -2)),
             drift=np.vecmat(state.share, drift),
         )
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import Derivatives
-from servobench.plant.contract.lanes import nearest_rotation
+from servobench.plant.contract.lanes import last_first, nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.twin import TOOL, links_of
@@ -175,8 +175,8 @@ class ParametricModel:
             turn = None  # only the first camera turns
         by_zero = by_parameter[self._zeros]
         gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
-        by_angle = np.moveaxis(gear, -1, 0)[:, None, None, None, ..., None]
-        by_gear = np.moveaxis(arm.gear_ratio * joints, -1, 0)[:, None, None, None]
+        by_angle = last_first(gear)[:, None, None, None, ..., None]
+        by_gear = last_first(arm.gear_ratio * joints)[:, None, None, None]
         np.multiply(by_angle, by_zero, out=motions[:n])
         np.multiply(by_gear, by_zero, out=by_parameter[self._gears])
         places = _reversed_last(points, 3)
@@ -262,7 +262,7 @@ class ParametricModel:
         gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
         offset = arm.joint_offset + theta[..., self._zeros]
         angles = gear[..., None, :] * joints + offset[..., None, :]
-        angles = np.ascontiguousarray(np.moveaxis(angles, -1, 0))
+        angles = np.ascontiguousarray(last_first(angles))
         cosines = np.cos(angles)
         sines = np.sin(angles)
         marks = self.planned.marks.T.reshape(3, -1, *(1,) * (angles.ndim - 1))
@@ -338,7 +338,8 @@ def _axes_of(cameras: FloatArray, turn: FloatArray | None) -> list[FloatArray]:
         cameras: (..., c, 4, 4), in the same frame.
         turn: by which the first camera is turned about its optical axis, (..., k) [rad]; None for 0.
     """
-    axes = list(np.moveaxis(cameras[..., :3, :3], (-3, -1, -2), (0, 1, 2))[..., None])
+    lead = range(cameras.ndim - 3)
+    axes = list(cameras[..., :3, :3].transpose(-3, -1, -2, *lead)[..., None])
     if turn is not None:
         turned = Vectors(*axes[0]).about_z(np.cos(turn), -np.sin(turn))
         axes[0] = np.stack(np.broadcast_arrays(*turned))
@@ -379,8 +380,8 @@ def _write_pose(
 
 def _reversed_last(array: FloatArray, count: int) -> FloatArray:
     """Return an array whose first axes are its last ones, in reverse order: (..., k, c, p, 3) for (3, p, c, ..., k)."""
-    source = range(count)
-    return np.moveaxis(array, source, [-1 - axis for axis in source])
+    # `np.moveaxis` takes ten times as long.
+    return array.transpose(*range(count, array.ndim), *reversed(range(count)))
 
 
 def _sum_of(vectors: Iterable[FloatArray], factors: Iterable[FloatArray | float]) -> FloatArray:

@@ -46,7 +46,7 @@ def empty(fit, m=3, n=6):
         time=np.zeros(FRAMES),
         feature=np.zeros((FRAMES, m)),
         weight=np.zeros((FRAMES, m)),
-        path=np.zeros((FRAMES, fit.rows, 2 * n)),
+        path=np.zeros((fit.rows, FRAMES, 2 * n)),
         number=np.int_(0),
     )
 
@@ -101,7 +101,7 @@ def test_joints_between_rows_are_those_of_a_smooth_motion():
     back = 0.05 * np.arange(12)[::-1]
     path = joints_at(3.0 - back)
     delay = np.array([0.0, 0.02, 0.13, 0.4])
-    position, velocity = at_latency(path[None], delay, 0.05)
+    position, velocity = at_latency(path[:, None], delay, 0.05)
     step = 1e-5
     times = 3.0 - delay
     rates = (joints_at(times + step) - joints_at(times - step)) / (2.0 * step)

@@ -103,6 +103,6 @@ def _frames(fit: Fit, log: Log) -> Frames:
         time=time - log.time[0],
         feature=features,
         weight=np.ones_like(features),
-        path=np.concatenate([joints, places], axis=-1),
+        path=np.concatenate([joints, places], axis=-1).swapaxes(0, 1),
         number=np.array(len(rows)),
     )
