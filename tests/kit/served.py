@@ -27,7 +27,7 @@ def fresh_address():
     return f"127.{1 + number // 62_500 % 200}.{1 + number // 250 % 250}.{1 + number % 250}"
 
 
-def waited_for(condition, seconds=5.0):
+def waited_for(condition, seconds=20.0):
     """Return whether a condition comes true within a time."""
     due = time.monotonic() + seconds
     while not condition() and time.monotonic() < due:
@@ -74,7 +74,7 @@ def served(request=REQUEST, settings=None, *, lockstep=True):
 
 def connected(address, port):
     """Return a socket to a port by its name."""
-    return socket.create_connection((address, PORTS[port]), timeout=5.0)
+    return socket.create_connection((address, PORTS[port]), timeout=20.0)
 
 
 def packed(kind, body=b""):
