@@ -30,11 +30,13 @@ from servobench.controllers.stages.finish import Finish, scale_to_limit
 from servobench.controllers.stages.prediction import Predictor, PredictorState, shifted
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import ControllerDiverged
-from servobench.plant.contract.lanes import branch, norm
+from servobench.plant.contract.lanes import branch, norm, where
 from servobench.plant.contract.signals import BoolArray, Command, Observation
 
 REACH = np.array(1.0)  # [rad] by which a joint half-way may differ from the present one
 NEAR = 0.02  # [rad] length of half the way, up to which the present Jacobian serves
+# [1] Share of the way to the target that may be left half-way to it. Where more is left, it is out of reach.
+LEFT = 0.7
 
 
 class ServoState(NamedTuple):
@@ -286,18 +288,28 @@ class Servo:
         ahead: Ahead = self.calibration.ahead(calibration, bound, lead)
         if "preview" in self.law.owns:
             return ahead
-        inverse = damped_inverse(ahead.jacobian, self._aids.damping)
-        half = 0.5 * np.matvec(inverse, target - ahead.feature)
+        missing = 0.5 * (target - ahead.feature)
+        half = np.matvec(damped_inverse(ahead.jacobian, self._aids.damping), missing)
         middle = bound + scale_to_limit(half, REACH)
         # On curves the target is near, and a second look at the arm would cost as much as the first one for nothing.
-        return branch(norm(half) > NEAR, self._half_way, ahead, calibration, middle, lead)
+        given = (calibration, middle, lead, target)
+        return branch(norm(half) > NEAR, self._half_way, ahead, *given)
 
     def _half_way(
-        self, ahead: Ahead, calibration: CalibrationState, middle: FloatArray, lead: FloatArray
+        self,
+        ahead: Ahead,
+        calibration: CalibrationState,
+        middle: FloatArray,
+        lead: FloatArray,
+        target: FloatArray,
     ) -> Ahead:
-        """Return a prediction with the Jacobian of other joint positions, (..., n)."""
+        """Return a prediction with the Jacobian of other joint positions, (..., n), if they are nearer to the target.
+
+        They are not where the target is out of reach: there only the present Jacobian leads to the nearest point.
+        """
         there: Ahead = self.calibration.ahead(calibration, middle, lead)
-        return ahead._replace(jacobian=there.jacobian)
+        nearer = norm(target - there.feature) < LEFT * norm(target - ahead.feature)
+        return ahead._replace(jacobian=where(nearer, there.jacobian, ahead.jacobian))
 
     def _command(
         self,

@@ -226,8 +226,8 @@ def added(
 
 
 def first(frames: Frames, most: int) -> Frames:
-    """Return the buffer with `most` rows at most, a number that does not depend on other lanes."""
-    kept = range(min(most, FRAMES))
+    """Return the buffer with its first rows alone, a number that does not depend on other lanes."""
+    kept = range(most)
     rows = {name: getattr(frames, name).take(kept, axis=axis) for name, axis in ROWS.items()}
     return frames._replace(**rows)
 

@@ -237,15 +237,17 @@ class Calibration:
         history = np.concatenate([row[..., None, :], earlier], axis=-2)
         elapsed = float(observation.time) - state.begin
         travel = state.travel + norm(step)
-        state = state._replace(history=history, travel=travel, elapsed=elapsed)
+        past = state.past
+        phase = state.phase + 1
+        state = state._replace(
+            history=history, travel=travel, elapsed=elapsed, phase=phase, past=()
+        )
         least = MEMBERS
         if elapsed <= SEARCH_TIME:
             least = SEARCHED
         size = max(least, WORK // self._most_frames(elapsed))
         if state.share.shape[-1] > size:
             state = self._reduced(state, size)
-        past = state.past
-        state = state._replace(past=(), phase=state.phase + 1)
         state = branch(due, self._taken_in, state, observation, regression, past, late)
         state = self._worked(state, regression.delay)
         return state._replace(past=self._remembered(past, state, due, regression))
@@ -265,11 +267,10 @@ class Calibration:
         """Return the state with a frame more, by which earlier predictions are judged."""
         delay = regression.delay
         path = self._path(state.history, late)
-        time = np.full(state.travel.shape, state.elapsed)[()]
-        instant = time
+        instant = np.full(state.travel.shape, state.elapsed)[()]
         if late is not None:
             # Time and path are those at which it would have come if it were not late.
-            instant = time - late
+            instant = instant - late
         y = observation.feature
         most = np.where(state.lateness > 0.0, FRAMES, KEPT)
         frames = added(state.frames, most, instant, y, observation.valid, path)
@@ -471,8 +472,7 @@ class Calibration:
         errors = np.stack([y - by_regression, y - by_arm], axis=-2)
         most = np.square(MAX_ERROR * state.noise)[..., None]
         squares = np.minimum(np.vecdot(errors, errors), most)
-        few, many = MEMORIES
-        memory = np.where(state.frames.number < MANY_FRAMES, few, many)[..., None]
+        memory = np.where(state.frames.number < MANY_FRAMES, *MEMORIES)[..., None]
         mean = memory * state.errors + (1.0 - memory) * squares
         mean = np.where(np.isnan(state.errors), squares, mean)
         comparable = known.fitted & (known.moves == state.moves)
@@ -541,14 +541,13 @@ class Calibration:
         fits = state.phase == self._fitting
         if same_size and not np.any(due | fits):
             return past
-        path = self._path(state.history, None)
         new = Known(
             state.members,
             state.share,
             state.bias,
             regression.feature,
             regression.jacobian,
-            self._exposed(path, regression.delay),
+            self._exposed(self._path(state.history, None), regression.delay),
             state.fitted,
             regression.moves,
         )

@@ -186,10 +186,7 @@ def rotation_matrix(vector: npt.ArrayLike) -> FloatArray:
     # The angle of near ones is raised by 1, which avoids a division by zero and is not used.
     exact = np.sin(angle / 2) / (angle + near)
     quotient = np.where(near, series, exact)
-    vector_part = v * quotient
-    x = vector_part[..., 0]
-    y = vector_part[..., 1]
-    z = vector_part[..., 2]
+    x, y, z = np.moveaxis(v * quotient, -1, 0)
     w = np.cos(angle / 2)[..., 0]
     xx = x * x
     yy = y * y

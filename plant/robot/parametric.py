@@ -338,8 +338,8 @@ def _axes_of(cameras: FloatArray, turn: FloatArray | None) -> list[FloatArray]:
         cameras: (..., c, 4, 4), in the same frame.
         turn: by which the first camera is turned about its optical axis, (..., k) [rad]; None for 0.
     """
-    lead = range(cameras.ndim - 3)
-    axes = list(cameras[..., :3, :3].transpose(-3, -1, -2, *lead)[..., None])
+    rotations = cameras[..., :3, :3]
+    axes = list(rotations.transpose(-3, -1, -2, *range(cameras.ndim - 3))[..., None])
     if turn is not None:
         turned = Vectors(*axes[0]).about_z(np.cos(turn), -np.sin(turn))
         axes[0] = np.stack(np.broadcast_arrays(*turned))

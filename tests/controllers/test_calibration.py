@@ -207,6 +207,18 @@ def test_the_jacobian_is_that_of_the_true_arm_after_a_lap():
     assert steps["jacobian_error"].iloc[-1] < 0.02
 
 
+@pytest.mark.parametrize(("mismatch", "seed"), [("moderate", 46000), ("gear_ratio=50%", 46001)])
+def test_a_target_out_of_reach_is_approached_as_near_as_by_the_regression(mismatch, seed):
+    """The Jacobian half-way to it led 0.25 to 0.4 m away, with joints at their limits of speed."""
+    errors = []
+    for method in (METHOD, "regression_mfac"):
+        request = RunRequest("kinematic", method, "unreachable", Mismatch.parse(mismatch), seed)
+        row = carry_out(resolve(request, Settings())).row
+        assert row["outcome"] == "target_unreachable"
+        errors.append(row["steady_state_error"])
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
+
+
 def test_an_arm_that_is_believed_steps_by_its_jacobian_half_way_to_the_target():
     """A step errs by the cube of its length, by the Jacobian of where it begins by its square."""
     experiment = build(run(task="random"))
