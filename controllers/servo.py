@@ -35,8 +35,8 @@ from servobench.plant.contract.signals import BoolArray, Command, Observation
 
 REACH = np.array(1.0)  # [rad] by which a joint half-way may differ from the present one
 NEAR = 0.02  # [rad] length of half the way, up to which the present Jacobian serves
-# [1] Share of the way to the target that may be left half-way to it. Where more is left, it is out of reach.
-LEFT = 0.7
+# [1] Share of the way to the target from which on it is taken for out of reach, if that remains half-way to it
+REMAINDER = 0.7
 
 
 class ServoState(NamedTuple):
@@ -288,12 +288,12 @@ class Servo:
         ahead: Ahead = self.calibration.ahead(calibration, bound, lead)
         if "preview" in self.law.owns:
             return ahead
-        missing = 0.5 * (target - ahead.feature)
-        half = np.matvec(damped_inverse(ahead.jacobian, self._aids.damping), missing)
+        inverse = damped_inverse(ahead.jacobian, self._aids.damping)
+        half = 0.5 * np.matvec(inverse, target - ahead.feature)
         middle = bound + scale_to_limit(half, REACH)
         # On curves the target is near, and a second look at the arm would cost as much as the first one for nothing.
-        given = (calibration, middle, lead, target)
-        return branch(norm(half) > NEAR, self._half_way, ahead, *given)
+        far = norm(half) > NEAR
+        return branch(far, self._half_way, ahead, calibration, middle, lead, target)
 
     def _half_way(
         self,
@@ -308,7 +308,7 @@ class Servo:
         They are not where the target is out of reach: there only the present Jacobian leads to the nearest point.
         """
         there: Ahead = self.calibration.ahead(calibration, middle, lead)
-        nearer = norm(target - there.feature) < LEFT * norm(target - ahead.feature)
+        nearer = norm(target - there.feature) < REMAINDER * norm(target - ahead.feature)
         return ahead._replace(jacobian=where(nearer, there.jacobian, ahead.jacobian))
 
     def _command(

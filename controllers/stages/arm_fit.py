@@ -167,7 +167,7 @@ def at_latency(path: FloatArray, delay: FloatArray, grid: float) -> tuple[FloatA
     """
     *lead, count, frames, width = path.shape
     last = count - 1
-    x = np.minimum(np.maximum(last - delay / grid, 0.0), last)
+    x = np.clip(last - delay / grid, 0.0, last)
     first = np.minimum(x.astype(np.int_), last - 1)
     u = x - first
     one = np.ones_like(u)
@@ -225,9 +225,9 @@ def added(
     return frames._replace(**rows, number=frames.number + 1)
 
 
-def first(frames: Frames, most: int) -> Frames:
-    """Return the buffer with its first rows alone, a number that does not depend on other lanes."""
-    kept = range(most)
+def first(frames: Frames, count: int) -> Frames:
+    """Return the buffer with its first rows alone; how many must not depend on other lanes."""
+    kept = range(count)
     rows = {name: getattr(frames, name).take(kept, axis=axis) for name, axis in ROWS.items()}
     return frames._replace(**rows)
 

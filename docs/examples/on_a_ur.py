@@ -98,7 +98,7 @@ class UR(servobench.Plant):
         self.k, self.seen, self.shown, self.stamp, self.before = -1, False, -1.0, -1.0, None
         self.receive = RTDEReceiveInterface(self.config.host)
         self.control = None if self.config.dry_run else RTDEControlInterface(self.config.host)
-        # The program is heard of by two connections: this one may be the later
+        # This connection may hear later than the other one that the program runs
         due = time.monotonic() + 1.0
         while self.control and not self.running() and time.monotonic() < due:
             time.sleep(0.002)

@@ -166,11 +166,6 @@ def _reflected(R: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray
     return (left * signs) @ right
 
 
-def last_first(array: FloatArray) -> FloatArray:
-    """Return a view, (k, ...), of an array (..., k), in a tenth of the time of `numpy.moveaxis`."""
-    return array.transpose(-1, *range(array.ndim - 1))
-
-
 def norm(x: FloatArray) -> FloatArray:
     """Return ‖x‖, (...), for x (..., n)."""
     return np.sqrt(np.vecdot(x, x))

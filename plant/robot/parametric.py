@@ -32,7 +32,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.features import Derivatives
-from servobench.plant.contract.lanes import last_first, nearest_rotation
+from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.twin import TOOL, links_of
@@ -175,8 +175,8 @@ class ParametricModel:
             turn = None  # only the first camera turns
         by_zero = by_parameter[self._zeros]
         gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
-        by_angle = last_first(gear)[:, None, None, None, ..., None]
-        by_gear = last_first(arm.gear_ratio * joints)[:, None, None, None]
+        by_angle = _last_first(gear)[:, None, None, None, ..., None]
+        by_gear = _last_first(arm.gear_ratio * joints)[:, None, None, None]
         np.multiply(by_angle, by_zero, out=motions[:n])
         np.multiply(by_gear, by_zero, out=by_parameter[self._gears])
         places = _reversed_last(points, 3)
@@ -262,7 +262,7 @@ class ParametricModel:
         gear = arm.gear_ratio * (1.0 + theta[..., self._gears])
         offset = arm.joint_offset + theta[..., self._zeros]
         angles = gear[..., None, :] * joints + offset[..., None, :]
-        angles = np.ascontiguousarray(last_first(angles))
+        angles = np.ascontiguousarray(_last_first(angles))
         cosines = np.cos(angles)
         sines = np.sin(angles)
         marks = self.planned.marks.T.reshape(3, -1, *(1,) * (angles.ndim - 1))
@@ -378,9 +378,14 @@ def _write_pose(
         np.negative(axis, out=motion)
 
 
+def _last_first(array: FloatArray) -> FloatArray:
+    """Return a view, (k, ...), of an array (..., k)."""
+    # `np.moveaxis` takes ten times as long, here and below.
+    return array.transpose(-1, *range(array.ndim - 1))
+
+
 def _reversed_last(array: FloatArray, count: int) -> FloatArray:
     """Return an array whose first axes are its last ones, in reverse order: (..., k, c, p, 3) for (3, p, c, ..., k)."""
-    # `np.moveaxis` takes ten times as long.
     return array.transpose(*range(count, array.ndim), *reversed(range(count)))
 
 

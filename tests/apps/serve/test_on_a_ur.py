@@ -110,7 +110,7 @@ def hang_up(end):
 def forwarded(address, delay):
     """Yield an address that stands for another one; what its first client of RTDE hears comes later by a delay [s]."""
     own = fresh_address()
-    delays = {"RTDE": iter([delay])}
+    first_of_rtde = [delay]
 
     def pump(source, sink, delay):
         with suppress(OSError):
@@ -127,7 +127,9 @@ def forwarded(address, delay):
                 far.settimeout(None)
                 stack.callback(hang_up, near)
                 stack.callback(hang_up, far)
-                late = next(delays.get(port, iter(())), 0.0)
+                late = 0.0
+                if port == "RTDE" and first_of_rtde:
+                    late = first_of_rtde.pop()
                 Thread(target=pump, args=(near, far, 0.0), daemon=True).start()
                 Thread(target=pump, args=(far, near, late), daemon=True).start()
 
