@@ -209,7 +209,7 @@ def test_the_jacobian_is_that_of_the_true_arm_after_a_lap():
 
 @pytest.mark.parametrize(("mismatch", "seed"), [("moderate", 46000), ("gear_ratio=50%", 46001)])
 def test_a_target_out_of_reach_is_approached_as_near_as_by_the_regression(mismatch, seed):
-    """The Jacobian half-way to it led 0.25 to 0.4 m away, with joints at their limits of speed."""
+    """The Jacobian half-way to it led 0.25 to 0.4 m away."""
     errors = []
     for method in (METHOD, "regression_mfac"):
         request = RunRequest("kinematic", method, "unreachable", Mismatch.parse(mismatch), seed)
