@@ -17,7 +17,6 @@ from typing import Any
 
 import casadi
 import numpy as np
-import numpy.typing as npt
 
 from servobench.fmus.variables import FIXED, INPUT, PARAMETER, STATE, ArmLayout, Layout, View
 from servobench.plant.cameras.optics import Optics
@@ -31,7 +30,7 @@ from servobench.plant.cameras.symbolic import (
     symbolic_rotation,
     valid_features,
 )
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import AnyArray, FloatArray, Shape
 from servobench.plant.robot.mechanics import FREQUENCIES, MAX_PART
 
 IN_MACROS = {ord("("): "_", ord(")"): ""}  # DER(BALL) is DER_BALL there
@@ -237,7 +236,7 @@ def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry
     return SetupGeometry(arm, target, poses, optics)
 
 
-def _objects(values: SX, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+def _objects(values: SX, shape: Shape) -> AnyArray:
     """Return expressions, (k, 1), as an array of them."""
     array = np.empty(values.numel(), dtype=object)
     for k in range(array.size):

@@ -21,7 +21,7 @@ import numpy as np
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.optics import COLUMNS
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
@@ -55,7 +55,7 @@ class Group:
     """One variable of the model: a row of `variables.csv` in the folder of the model."""
 
     name: str  # as FMI 3 shows it
-    shape: tuple[int, ...]  # sizes of its axes
+    shape: Shape  # sizes of its axes
     role: str  # one of the roles above; a fixed parameter holds from the end of initialisation on
     unit: str  # as in the description; "1" for none
     description: str  # one sentence

@@ -13,7 +13,7 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
@@ -96,7 +96,7 @@ class NetworkEstimator(Estimator[NetworkState]):
         self._config = config
         self._network = networks.jacobian
         self._position = b""
-        self._shape: tuple[int, ...] = (-1,)
+        self._shape: Shape = (-1,)
         self._theta = np.empty(0)
         self._rows = np.empty(0)
         self._jacobian = np.empty(0)

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
@@ -274,7 +274,7 @@ class ControllerNetwork:
         return centres, np.ones(len(centres)), -1.0 / self.widths**2
 
 
-def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, ...]) -> None:
+def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: Shape) -> None:
     """Check shapes and values of the arrays of a network and make them read-only."""
     for name, wanted in shapes.items():
         array = np.array(getattr(network, name), dtype=np.float64)

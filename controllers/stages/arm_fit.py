@@ -27,7 +27,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.features import Derivatives, FeatureModel
 from servobench.plant.contract.lanes import branch, pick, plus_diagonal, where
 from servobench.plant.contract.signals import BoolArray
@@ -331,15 +331,13 @@ class Fit:
         self._draws = generator.uniform(-1.0, 1.0, (DRAWS, len(names)))
         _, self._planned = model.start(())
 
-    def start(self, lead: tuple[int, ...], count: int, latency: FloatArray) -> Members:
+    def start(self, lead: Shape, count: int, latency: FloatArray) -> Members:
         """Return members that begin at different arms, the first one at the nominal one."""
         members = self.spawned(lead, np.zeros(lead, dtype=np.int_), count, latency)
         members.theta[..., 0, :] = 0.0
         return members
 
-    def spawned(
-        self, lead: tuple[int, ...], first: IntArray, count: int, latency: FloatArray
-    ) -> Members:
+    def spawned(self, lead: Shape, first: IntArray, count: int, latency: FloatArray) -> Members:
         """Return new members, by the rows of the table of draws from `first` (...) on."""
         each = np.arange(count)
         rows = (first[..., None] + each) % len(self._draws)

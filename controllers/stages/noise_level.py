@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.lanes import branch
 
 LOG_RATIOS = np.log(2.0) * np.arange(-2, 8)  # [1] ln of σ_j relative to the guess
@@ -35,7 +35,7 @@ class NoiseLevel(NamedTuple):
     guess: FloatArray  # the first σ², (...), m²
 
     @classmethod
-    def start(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:
+    def start(cls, deviation: float, lead: Shape = ()) -> NoiseLevel:
         """Return the state of a first guess of σ, m, with leading axes of the shape `lead`."""
         variance = np.full(lead, deviation**2)[()]
         prior = np.square(LOG_RATIOS / LOG_DEVIATION)

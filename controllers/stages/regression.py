@@ -39,7 +39,7 @@ import numpy as np
 
 from servobench.controllers.algebra import nearest_rotation
 from servobench.controllers.controller import RobotKnowledge
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import Tree, branch, map_arrays, outer, pick
 from servobench.plant.contract.signals import BoolArray
@@ -223,7 +223,7 @@ class Regression:
         self._P0 = np.concatenate([arm_variances, map_variances], axis=1)
         self._walk = np.concatenate([arm_walks, map_walks], axis=1)
 
-    def start(self, lead: tuple[int, ...], frame: float) -> RegressionState:
+    def start(self, lead: Shape, frame: float) -> RegressionState:
         """Return the state of the nominal model, for the variance σ² of a frame, m²."""
         m = self._m
         W = np.zeros((m, self._map.stop))

@@ -32,6 +32,7 @@ from servobench.fmus.controllers.program import (
     numbers,
     operand,
 )
+from servobench.plant.contract.checks import AnyArray, Shape
 from servobench.plant.contract.facts import read_beside
 
 DTYPES = {"b": np.dtype(np.bool_), "i": np.dtype(np.int_), "f": np.dtype(np.float64)}
@@ -60,12 +61,12 @@ class Traced(NDArrayOperatorsMixin):
     flags: ClassVar[SimpleNamespace] = SimpleNamespace(writeable=True)
 
     @classmethod
-    def of(cls, node: Node, shape: tuple[int, ...], kind: str = "f") -> Traced:
+    def of(cls, node: Node, shape: Shape, kind: str = "f") -> Traced:
         """Return the array (shape) of a node, in row-major order."""
         return cls(Buffer(node), np.arange(node.size).reshape(shape), kind)
 
     @classmethod
-    def plain(cls, numbers: npt.NDArray[Any]) -> Traced:
+    def plain(cls, numbers: AnyArray) -> Traced:
         """Return an array of numbers to which those of a program can be written."""
         kind = numbers.dtype.kind if numbers.dtype.kind in DTYPES else "f"
         buffer = Buffer(np.array(numbers, dtype=np.float64).reshape(-1))
@@ -76,7 +77,7 @@ class Traced(NDArrayOperatorsMixin):
         """Whether its entries are plain numbers."""
         return isinstance(self.buffer.content, np.ndarray)
 
-    def numbers(self) -> npt.NDArray[Any]:
+    def numbers(self) -> AnyArray:
         """Return the numbers of a constant array.
 
         Raises:
@@ -84,10 +85,10 @@ class Traced(NDArrayOperatorsMixin):
         """
         if not self.constant:
             raise NotTraceable("it decides by a number that is known in the run only")
-        values: npt.NDArray[Any] = self.buffer.content[self.places]
+        values: AnyArray = self.buffer.content[self.places]
         return values.astype(DTYPES[self.kind])
 
-    def operand(self, shape: tuple[int, ...] | None = None) -> Operand:
+    def operand(self, shape: Shape | None = None) -> Operand:
         """Return its entries, or those of a shape to which they are broadcast, as an operand."""
         node = self.buffer.content
         if self.constant:
@@ -129,7 +130,7 @@ class Traced(NDArrayOperatorsMixin):
         del types
         return Traced.function(function, arguments, options)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:  # noqa: ANN401
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:  # noqa: ANN401
         """Return the numbers of a constant array."""
         del copy
         return np.asarray(self.numbers(), dtype=dtype)
@@ -251,7 +252,7 @@ def as_numbers(value: Any) -> Any:  # noqa: ANN401 - an array, or lists and tupl
     return value
 
 
-def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
+def spread(array: Traced, shape: Shape) -> Traced:
     """Return an array broadcast to a shape."""
     return array.arranged(np.broadcast_to(array.places, shape))
 

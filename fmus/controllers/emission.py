@@ -9,10 +9,9 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.fmus.controllers.arrays import ARITHMETIC, COMPARISONS, EMPTY_REDUCTIONS
 from servobench.fmus.controllers.program import (
@@ -31,6 +30,7 @@ from servobench.fmus.controllers.program import (
     Places,
     parts,
 )
+from servobench.plant.contract.checks import AnyArray, Shape
 
 # Share of an array up to which entries that are read after it is overwritten are kept elsewhere.
 KEPT_SHARE = 0.3
@@ -210,7 +210,7 @@ class Writer:
         self.lines.append(f"double {name}[{max(size, 1)}];")
         return Entries(name, np.arange(size))
 
-    def table(self, kind: str, numbers: npt.NDArray[Any]) -> str:
+    def table(self, kind: str, numbers: AnyArray) -> str:
         """Return the name of a static array of numbers."""
         texts = ", ".join(map(literal, numbers.reshape(-1).tolist()))
         return self.tables.setdefault(f"{kind}[] = {{{texts}}}", f"c{len(self.tables)}")
@@ -297,15 +297,15 @@ class Writer:
             self.assign(Entries(target.array, places), value, form)
 
     def pieces(
-        self, places: Places, operand: Operand, shape: tuple[int, ...]
-    ) -> list[tuple[Places, Value, tuple[int, ...]]]:
+        self, places: Places, operand: Operand, shape: Shape
+    ) -> list[tuple[Places, Value, Shape]]:
         """Return values and shapes for places, by parts of joined arrays."""
         node = operand.node
         if node.operation != JOIN or node in self.found:
             return [(places, self.value(operand), shape)]
         found = []
         for part, among, inside in parts(node, operand.places.reshape(-1)):
-            form: tuple[int, ...] = among.shape
+            form: Shape = among.shape
             if np.array_equal(inside, np.arange(part.places.size)):
                 form = part.places.shape
             own = Operand(part.node, part.places.reshape(-1)[inside])
@@ -326,7 +326,7 @@ class Writer:
                 return
         self.each("{} = " + value.text + ";", [target, *value.entries], tuple(shape))
 
-    def each(self, text: str, entries: Sequence[Entries], shape: tuple[int, ...]) -> None:
+    def each(self, text: str, entries: Sequence[Entries], shape: Shape) -> None:
         """Write a statement for each of some entries (shape)."""
         size = prod(shape)
         if size == 0:
@@ -338,7 +338,7 @@ class Writer:
             form = ()
         self.lines += looped(form, [text.format(*self.texts(entries, form))])
 
-    def texts(self, entries: Sequence[Entries], shape: tuple[int, ...]) -> list[str]:
+    def texts(self, entries: Sequence[Entries], shape: Shape) -> list[str]:
         """Return entries in loops over a shape."""
         rows = [prod(shape[k + 1 :]) for k in range(len(shape))]
         texts = []

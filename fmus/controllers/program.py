@@ -13,9 +13,8 @@ from math import prod
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import IntArray
+from servobench.plant.contract.checks import AnyArray, IntArray, Shape
 
 Places: TypeAlias = IntArray
 
@@ -50,7 +49,7 @@ class Node:
 
     operation: str
     operands: tuple[Operand, ...]
-    shape: tuple[int, ...]
+    shape: Shape
     block: Block
     epoch: int  # number of decisions and overwritten arrays before it in its block
     detail: Any = None
@@ -111,7 +110,7 @@ def block() -> Iterator[Block]:
 def add(
     operation: str,
     operands: Sequence[Operand],
-    shape: tuple[int, ...],
+    shape: Shape,
     detail: Any = None,  # noqa: ANN401
 ) -> Node:
     """Record a node at the end of the present block."""
@@ -126,7 +125,7 @@ def add(
 def computed(
     operation: str,
     operands: Sequence[Operand],
-    shape: tuple[int, ...],
+    shape: Shape,
     detail: Any = None,  # noqa: ANN401
 ) -> Node:
     """Return a node without effects; the same computation is recorded once."""
@@ -140,7 +139,7 @@ def computed(
     return found
 
 
-def numbers(values: npt.NDArray[Any]) -> Node:
+def numbers(values: AnyArray) -> Node:
     """Return a node of plain numbers."""
     column = np.array(values, dtype=np.float64).reshape(-1)
     root = _BLOCKS[0]

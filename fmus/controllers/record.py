@@ -40,10 +40,10 @@ from servobench.fmus.controllers.program import STORE, Node, add, block, source
 from servobench.fmus.product import committed
 from servobench.plant.contract import checks, lanes
 from servobench.plant.contract.cache import COMPILED, cached, key_of
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 
 Inputs: TypeAlias = Mapping[str, Any]
-Shapes: TypeAlias = Mapping[str, tuple[tuple[int, ...], str]]
+Shapes: TypeAlias = Mapping[str, tuple[Shape, str]]
 PACKAGE = "servobench."
 OWN = "servobench.fmus."
 HEADERS = ("controller.h", "linear_algebra.h")

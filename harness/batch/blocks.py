@@ -32,7 +32,6 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.isolation import (
@@ -54,6 +53,7 @@ from servobench.harness.run.own_metrics import METRIC_REGISTRY
 from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import COMPLETED, CRASHED, LOST, Ending, RunResult, ends_batch
+from servobench.plant.contract.checks import AnyArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import REMARKS, remark
 from servobench.plant.fmu.release import delayed_releases
@@ -484,7 +484,7 @@ def unpack_result(job: Job, told: object) -> RunResult:
     return RunResult(row, table, image, trace)
 
 
-def _pack_array(array: npt.NDArray[Any] | None) -> str | None:
+def _pack_array(array: AnyArray | None) -> str | None:
     if array is None:
         return None
     content = BytesIO()
@@ -492,16 +492,14 @@ def _pack_array(array: npt.NDArray[Any] | None) -> str | None:
     return b64encode(content.getvalue()).decode("ascii")
 
 
-def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
+def _unpack_array(text: str | None) -> AnyArray | None:
     """Return the array of a text; a ValueError if it is that of none."""
     if text is None:
         return None
     with configuration_errors(
         "", EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError
     ):
-        array: npt.NDArray[Any] = np.lib.format.read_array(
-            BytesIO(b64decode(text)), allow_pickle=False
-        )
+        array: AnyArray = np.lib.format.read_array(BytesIO(b64decode(text)), allow_pickle=False)
     return array
 
 

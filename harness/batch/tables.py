@@ -10,7 +10,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -19,6 +18,7 @@ import pyarrow.parquet as pq
 from servobench.harness.run.metrics import BUILT_IN
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import SHORT_NAMES, Row
+from servobench.plant.contract.checks import AnyArray
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -296,7 +296,7 @@ def lacking(kind: str, schema: pa.Schema) -> str:
     return ""
 
 
-def steps_of_run(records: npt.NDArray[Any], run_id: str) -> pd.DataFrame:
+def steps_of_run(records: AnyArray, run_id: str) -> pd.DataFrame:
     """Return the table of steps of a run from the records that another process has sent.
 
     Raises:

@@ -24,7 +24,7 @@ from servobench.harness.run.resolution import ResolvedRun, check_settings, resol
 from servobench.harness.run.sampling import Drawn
 from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import AnyArray, FloatArray, as_array
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_seed
@@ -396,7 +396,7 @@ class OutsideScene:
 
 
 @final
-class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
+class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
     """Many runs of a task that advance together, each with a robot, a target and noise of its own.
 
     A lane is the same run, to the bit, as a `ServoEnv` with its seed. All episodes have the same length and are reset

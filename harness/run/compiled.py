@@ -33,7 +33,7 @@ from servobench.harness.config.source import PACKAGE_FOLDER
 from servobench.harness.run.experiment import Experiment
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.contract.cache import COMPILED, cached, key_of
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.faults import ControllerDiverged, FilterDiverged
 from servobench.plant.contract.settings import remark
@@ -78,7 +78,7 @@ def record_step(entry: ControllerEntry, controller: Controller) -> tuple[Recorde
         )
     spec = servo.knowledge.spec
     groups = controller_groups(spec.n, spec.m, 1 + servo.knowledge.preview, spec.feature_unit)
-    shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
+    shapes: dict[str, tuple[Shape, str]] = {"time": ((), "f")}
     for group in groups:
         if group.role == INPUT:
             shapes[group.name] = (group.shape, "b" if group.name == SEEN else "f")

@@ -10,7 +10,6 @@ from collections.abc import Hashable
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.controller import Controller, Diagnostics
 from servobench.controllers.servo import Servo, ServoState
@@ -19,7 +18,7 @@ from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import AnyArray, FloatArray, IntArray
 from servobench.plant.contract.lanes import Lanes, Tree, map_arrays, take
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 
@@ -67,7 +66,7 @@ class Ends:
     def spread(self, tree: Tree, before: Tree) -> Tree:
         """Return arrays of the runs under way in their places among all runs; the others keep those from before."""
 
-        def placed(values: npt.NDArray[Any], old: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        def placed(values: AnyArray, old: AnyArray) -> AnyArray:
             spread = old.copy()
             spread[self.running] = values
             return spread

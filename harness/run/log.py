@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import (
@@ -62,7 +62,7 @@ class Steps:
     diagnostics: dict[str, FloatArray]
 
     @classmethod
-    def unknown(cls, spec: PlantSpec, periods: int, lanes: tuple[int, ...] = ()) -> Steps:
+    def unknown(cls, spec: PlantSpec, periods: int, lanes: Shape = ()) -> Steps:
         """Return rows of which no number is known, of one run or of runs in lanes."""
 
         def empty(*shape: int) -> FloatArray:
@@ -157,7 +157,7 @@ class Steps:
 class StepLog:
     """Collects the rows of a run, or of runs side by side, in arrays that are made beforehand."""
 
-    def __init__(self, spec: PlantSpec, periods: int, lanes: tuple[int, ...] = ()) -> None:
+    def __init__(self, spec: PlantSpec, periods: int, lanes: Shape = ()) -> None:
         """Prepare an empty log.
 
         Args:

@@ -20,7 +20,7 @@ from servobench.harness.config.registry import DECLARED
 from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.harness.run.scenario import Span
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import AnyArray, FloatArray, IntArray
 from servobench.plant.contract.lanes import norm
 
 SETTLING_SHARE = 0.05  # band as a share of the initial error
@@ -272,7 +272,7 @@ def _overruns(run: Judged) -> FloatArray:
     return run.same(float(np.count_nonzero(times > 1e6 * run.period)))
 
 
-def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _columns(values: AnyArray) -> AnyArray:
     """Return values (k, ...) or (k, ..., m) with the period as the last, contiguous axis."""
     return np.ascontiguousarray(np.moveaxis(values, 0, -1))
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, IntArray, as_array
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape, as_array
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
@@ -247,7 +247,7 @@ class World(Abilities):
     world that carries out runs side by side have the leading axis `lead`.
     """
 
-    lead: tuple[int, ...] = ()
+    lead: Shape = ()
     """Number of runs side by side, as the shape of the leading axis; () for a single run."""
 
     lag: float | None = None

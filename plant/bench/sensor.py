@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
 from servobench.plant.contract.sensing import (
@@ -54,7 +54,7 @@ class Sensor:
         m: int,
         interval: float,
         seed: Seeds,
-        lead: tuple[int, ...],
+        lead: Shape,
     ) -> None:
         """Begin all streams.
 
@@ -187,7 +187,7 @@ class Spell(NamedTuple):
     value: FloatArray  # (..., *), drawn for the present spell, or for the last one
 
     @classmethod
-    def none(cls, lead: tuple[int, ...], value: FloatArray) -> Spell:
+    def none(cls, lead: Shape, value: FloatArray) -> Spell:
         """Return the state before the first frame, outside of any spell."""
         left = np.zeros(lead, dtype=np.int_)[()]
         inside = np.zeros(lead, dtype=np.bool_)[()]

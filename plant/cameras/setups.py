@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.cameras.optics import Optics, ideal_optics, in_image, project, project_rates
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.sensing import EXTENTS, LENGTH
@@ -201,9 +201,7 @@ class SensingSetup:
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"
             )
 
-    def _check_array(
-        self, name: str, made: object, shape: tuple[int, ...], points: FloatArray
-    ) -> None:
+    def _check_array(self, name: str, made: object, shape: Shape, points: FloatArray) -> None:
         """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
         expected = (
             f"sensing {self.name}: {name} must return float64 or float32 of shape {shape} for points "

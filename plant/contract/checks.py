@@ -1,12 +1,15 @@
 """Checks of arrays and numbers at the boundary of a function."""
 
 import math
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
+AnyArray = npt.NDArray[Any]
+Shape: TypeAlias = tuple[int, ...]  # sizes of axes, often of the leading ones alone
 REAL = "fiub"  # kinds of arrays, as numpy names them
 
 
@@ -30,7 +33,7 @@ def real_numbers(name: str, value: npt.ArrayLike) -> FloatArray:
     return np.array(given, dtype=np.float64)
 
 
-def as_array(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+def as_array(name: str, value: npt.ArrayLike, shape: Shape) -> FloatArray:
     """Return a read-only float64 copy of `value`.
 
     Args:

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple, Protocol
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 
 
 class Derivatives(NamedTuple):
@@ -33,7 +33,7 @@ class FeatureModel(Protocol):
         """Return the place of the parameters whose names begin with a prefix."""
         ...
 
-    def start(self, lead: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
         """Return θ (..., P) and cameras (..., c, 4, 4) of the nominal robot."""
         ...
 

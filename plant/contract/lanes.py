@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import AnyArray, FloatArray, IntArray
 
 Tree = TypeVar("Tree")
 Lanes = Any  # an index of the leading axes
@@ -116,7 +116,7 @@ def repeat(
     return tree
 
 
-def pick(array: npt.NDArray[Any], index: IntArray, axes: int = 0) -> npt.NDArray[Any]:
+def pick(array: AnyArray, index: IntArray, axes: int = 0) -> AnyArray:
     """Return the entries at one index for each lane, along the first axis after the leading ones.
 
     Args:

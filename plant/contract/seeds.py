@@ -6,8 +6,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, IntArray
+from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 
+Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 Seeds: TypeAlias = int | Sequence[int]
 """The seed of a single run, or one for each of the runs side by side."""
 
@@ -59,8 +60,8 @@ class Stream:
         self,
         seeds: Seeds,
         name: str,
-        draw: Callable[[np.random.Generator, tuple[int, ...]], FloatArray],
-        shape: tuple[int, ...] = (),
+        draw: Draw,
+        shape: Shape = (),
         factor: float = 1.0,
     ) -> None:
         """Begin all streams.

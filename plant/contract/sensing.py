@@ -17,15 +17,16 @@ Noise", Sensors 23 (2023) 8518, for κ = 1; with μ = 0 and κ > 1 `mixture` is 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.dependence import Only
+from servobench.plant.contract.seeds import Draw
 from servobench.plant.contract.settings import (
     Delay,
     Extent,
@@ -205,9 +206,6 @@ def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, f
             changes["noise"] = axis.family
     return changes
 
-
-Shape: TypeAlias = tuple[int, ...]
-Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 
 # Floor of differences that rounding could make 0 or negative: half the grid of the generator's numbers.
 TINY = 2.0**-54

@@ -40,7 +40,6 @@ from typing import (
 )
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import (
     AllowInfNan,
@@ -53,7 +52,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass, rebuild_dataclass
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import AnyArray, FloatArray
 from servobench.plant.contract.units import (
     EXTENT,
     alternatives,
@@ -133,7 +132,7 @@ def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
     return float(number)
 
 
-def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - as read from a file
+def _as_values(value: Any) -> AnyArray:  # noqa: ANN401 - as read from a file
     if isinstance(value, np.ndarray) and value.dtype.kind in "bU":
         return value
     entries = value if isinstance(value, list | tuple) else [value]
@@ -149,7 +148,7 @@ Names: TypeAlias = Annotated[
 """One name or several."""
 Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
 """An array of numbers; in a file, a number or a list of numbers."""
-Values: TypeAlias = Annotated[npt.NDArray[Any], BeforeValidator(_as_values)]
+Values: TypeAlias = Annotated[AnyArray, BeforeValidator(_as_values)]
 """An array of numbers, of truth values or of texts; in a file, one of them or a list."""
 Extent: TypeAlias = Annotated[NonNegative | str, PlainValidator(_as_extent)]
 """A number, 0 or above, or a text such as "2px"."""

@@ -16,6 +16,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any, Self
 
+from servobench.plant.contract.checks import Shape
 from servobench.plant.contract.settings import suggest
 from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.archive import DESCRIPTION
@@ -90,7 +91,7 @@ class FmuDescription:
 
     @cached_property
     def _families(self) -> dict[str, list[Variable]]:
-        families: dict[str, list[tuple[tuple[int, ...], Variable]]] = {}
+        families: dict[str, list[tuple[Shape, Variable]]] = {}
         for variable in self.variables:
             match = re.fullmatch(r"(.+)\[([0-9, ]+)\](\)?)", variable.name)
             if match is not None:

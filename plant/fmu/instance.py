@@ -19,9 +19,8 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import AnyArray, FloatArray, Shape
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
 from servobench.plant.fmu.dialect import FmiDialect
@@ -50,7 +49,7 @@ class Port:
         variables: value references and their number, for C.
     """
 
-    def __init__(self, variables: Sequence[Variable], lead: tuple[int, ...] = ()) -> None:
+    def __init__(self, variables: Sequence[Variable], lead: Shape = ()) -> None:
         """Prepare the buffer, whose leading axis is `lead`."""
         self.members = tuple(variables)
         self.values: FloatArray = np.zeros((*lead, total_size(variables)))
@@ -229,7 +228,7 @@ class Instance(ABC):
     ) -> RawCall:
         """Return a function that reads or writes one variable of any numeric type by `values`."""
         word, kind = self.dialect.kinds[variable.type]
-        buffer: npt.NDArray[Any] = np.zeros(variable.size, dtype=kind)
+        buffer: AnyArray = np.zeros(variable.size, dtype=kind)
         function = self.function(f"{verb}{word}")
         place = self._buffer(ctypes.c_void_p(buffer.ctypes.data), variable.size)
         call = partial(function, self._component, *Port([variable]).variables, *place)

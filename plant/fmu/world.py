@@ -14,11 +14,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup, TrueModel, World
-from servobench.plant.contract.checks import FloatArray, IntArray, as_array, is_finite, whole_steps
+from servobench.plant.contract.checks import (
+    AnyArray,
+    FloatArray,
+    IntArray,
+    Shape,
+    as_array,
+    is_finite,
+    whole_steps,
+)
 from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
@@ -408,7 +415,7 @@ class FmuWorld(World):
         self._nominal = None
 
 
-def read_sized(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> FmuDescription:
+def read_sized(path: Path, values: Mapping[str, AnyArray]) -> FmuDescription:
     """Return the description of the FMU at `path` with the structural parameters that a mapping gives.
 
     Raises:
@@ -425,7 +432,7 @@ def read_sized(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> FmuDescrip
     return description.resized(sizes)
 
 
-def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -> None:
+def check_value(variables: list[Variable], name: str, value: AnyArray) -> None:
     """Check that a value fits the type of the parameter that a mapping names.
 
     Raises:
@@ -464,8 +471,8 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
 
 def setters(
     description: FmuDescription,
-    parameters: Mapping[str, npt.NDArray[Any]],
-    lead: tuple[int, ...] = (),
+    parameters: Mapping[str, AnyArray],
+    lead: Shape = (),
 ) -> list[Setter]:
     """Return functions that give parameters their values in an instance, by the row of its run; sizes come first.
 
@@ -487,9 +494,7 @@ def setters(
     return sizes + others
 
 
-def _setter(
-    variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]
-) -> Setter:
+def _setter(variables: list[Variable], name: str, value: AnyArray, lead: Shape) -> Setter:
     size = total_size(variables)
     given = np.asarray(value)
     if given.shape not in ((), (size,), (*lead, size)):

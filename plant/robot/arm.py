@@ -18,14 +18,14 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, Shape, as_array
 
 # IntArray of the factors in a cross product
 YZX = np.array([1, 2, 0])
 ZXY = np.array([2, 0, 1])
 
 
-def freeze_arrays(owner: object, shape: tuple[int, ...], *names: str) -> None:
+def freeze_arrays(owner: object, shape: Shape, *names: str) -> None:
     """Check that fields of a frozen dataclass are arrays of a shape, and make them read-only.
 
     Raises:

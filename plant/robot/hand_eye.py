@@ -15,7 +15,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, Shape, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
 from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
 
@@ -37,7 +37,7 @@ class RobotModel(ABC):
     """Whether the cameras are beside the arm and the target on it, or the reverse."""
 
     @property
-    def lead(self) -> tuple[int, ...]:
+    def lead(self) -> Shape:
         """Sizes of the leading axes; () for a single robot."""
         return self.arm.tool.shape[:-1]
 

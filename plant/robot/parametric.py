@@ -30,7 +30,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.features import Derivatives
 from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
@@ -111,7 +111,7 @@ class ParametricModel:
         end = len(self.names)
         return slice(end - len(POSE) * len(self.planned.poses), end)
 
-    def start(self, lead: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
         """Return `theta` and `cameras` of the planned robot for leading axes."""
         cameras = self.planned.poses
         theta = np.zeros((*lead, len(self.names)))
