@@ -10,7 +10,7 @@ group `servobench.tasks`.
 """
 
 from dataclasses import is_dataclass, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from servobench.harness.config.entries import Kind, check_settings, summary_of
 from servobench.harness.config.registry import Registry
@@ -90,8 +90,8 @@ class TargetTask(Task):
     duration: Duration = 10.0
     """[s] length of the run"""
 
-    any_robot: ClassVar[bool] = True
-    places: ClassVar[tuple[str, ...]] = ("start", "target")
+    any_robot = True
+    places = ("start", "target")
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -134,9 +134,9 @@ class CurveTask(Task):
     laps: Count = 2
     """laps in the run; the last one is judged"""
 
-    any_robot: ClassVar[bool] = True
-    places: ClassVar[tuple[str, ...]] = ("start", "centre")
-    judged_part: ClassVar[str] = "the last lap"
+    any_robot = True
+    places = ("start", "centre")
+    judged_part = "the last lap"
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -171,9 +171,9 @@ class LineTask(Task):
     duration: Duration = 10.0
     """[s] length of the run"""
 
-    any_robot: ClassVar[bool] = True
-    places: ClassVar[tuple[str, ...]] = ("start", "begin", "end")
-    judged_part: ClassVar[str] = "the second half"
+    any_robot = True
+    places = ("start", "begin", "end")
+    judged_part = "the second half"
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -196,9 +196,9 @@ class WaypointTask(Task):
     settle: NonNegative = 2.0
     """[s] rest after the last waypoint"""
 
-    any_robot: ClassVar[bool] = True
-    places: ClassVar[tuple[str, ...]] = ("start",)
-    judged_part: ClassVar[str] = "the second half"
+    any_robot = True
+    places = ("start",)
+    judged_part = "the second half"
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""

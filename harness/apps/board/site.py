@@ -100,7 +100,7 @@ def read_entries(folders: Iterable[Path]) -> dict[str, Entry]:
     heads.sort(key=lambda each: each[0].created)
     totals = Counter((head.author, head.method) for head, _ in heads)
     counts: Counter[tuple[str, str]] = Counter()
-    entries: dict[str, Entry] = {}
+    entries = {}
     for head, folder in heads:
         author = head.author, head.method
         counts[author] += 1

@@ -53,7 +53,7 @@ def read_information(path: Path) -> FmuInformation:
     """
     root = extract_fmu(path)
     binaries = root / "binaries"
-    platforms: list[str] = []
+    platforms = []
     if binaries.is_dir():
         platforms = sorted(item.name for item in binaries.iterdir())
     return FmuInformation(
@@ -192,7 +192,7 @@ def _variables(description: FmuDescription, header: list[str]) -> list[Variable]
     """Return the variables of the columns; in FMI 3 the columns `name[1]`, … belong to one array variable."""
     known = {variable.name for variable in description.variables}
     names = [name if name in known else name.partition("[")[0] for name in header[1:]]
-    variables: list[Variable] = []
+    variables = []
     for name in dict.fromkeys(names):
         variables += description.find(name, "reference run")
     return variables

@@ -122,7 +122,7 @@ def write_pictures(
     """
     with figure_style():
         figures = {"loops": draw_loops(loops), "stability_map": draw_stability_map(loops)}
-    paths: list[Path] = []
+    paths = []
     for name, figure in figures.items():
         paths += save_figure(figure, folder / FIGURES / name)
     fields: dict[str, object] = {}

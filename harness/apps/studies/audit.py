@@ -96,8 +96,8 @@ def significance(judged: pd.DataFrame) -> Iterator[Finding]:
     A claim says that of two methods that with the higher mean score is better; it is significant where a two-sided sign
     test over the robots says so at 5 % after Holm's correction over all claims.
     """
-    p_values: list[float] = []
-    near: list[bool] = []
+    p_values = []
+    near = []
     for _, place in judged.groupby(["challenge", "plant"], sort=False):
         losses = -place.pivot_table("score", "seed", "controller")
         order = list(losses.mean().sort_values(kind="stable").index)

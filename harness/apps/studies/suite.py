@@ -108,7 +108,7 @@ def carry_out_suite(
     tables = carry_out_parts(campaigns, out, how)
     declare_metrics({each.name: each.entry.record() for each in offered(metrics)})
     parts = []
-    answers: list[Answer] = []
+    answers = []
     for each in challenges:
         judged = judge(each, tables[each.name])
         if question is not None:

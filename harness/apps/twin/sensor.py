@@ -97,7 +97,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     """
     period = log.spec.period
     certain = _certain_extras(robot)
-    sensing: dict[str, float] = {}
+    sensing = {}
     if certain.get("turning", 0.0) > 0.0:
         sensing["camera_turn"] = certain["turning"]
     swing = math.hypot(certain.get("swing_sin", 0.0), certain.get("swing_cos", 0.0))
