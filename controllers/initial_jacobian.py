@@ -13,14 +13,14 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
 
-from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch, pick
 from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
-from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
+from servobench.plant.contract.signals import BoolArray, JacobianFunction, Observation, PlantSpec
 
 MIN_FEATURES = 3  # number of features that end a rest after its time where frames are lost or slow
 MIN_MOVED_SHARE = 0.1  # [1] least singular value of ΔQ in probing moves

@@ -7,8 +7,9 @@ With s = 1 nothing is changed. Settings in metres are therefore metres of a ball
 
 from dataclasses import dataclass, replace
 
-from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import JacobianFunction
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from servobench.controllers.algebra import damped_inverse
-from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.networks import rbf
 from servobench.controllers.networks.config import (
     ControllerTraining,
@@ -34,7 +34,7 @@ from servobench.controllers.networks.config import (
 )
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.contract.signals import JacobianFunction, PlantSpec
 
 Progress = Callable[[float, str], None]
 JACOBIAN_SHARE = 0.4  # [1] share of the Jacobian network in the work, for the progress bar

@@ -42,6 +42,7 @@ from servobench.harness.batch.isolation import (
     Pool,
     Task,
     Tell,
+    Work,
     Workers,
 )
 from servobench.harness.batch.plan import Cell
@@ -222,7 +223,7 @@ def _received(future: Future[Answer | bytes]) -> Answer:
 
 
 def _task(
-    function: Callable[[Any, Tell], None],
+    function: Work,
     block: Block,
     steps: bool = False,
     keep: Path | None = None,

@@ -69,13 +69,14 @@ ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upw
 
 # Passes an answer of JSON values up; None is only a sign of life
 Tell: TypeAlias = Callable[[Any], None]
+Work: TypeAlias = Callable[[Any, Tell], None]  # takes its argument, and tells its answers
 
 
 @dataclass(frozen=True)
 class Task:
     """A function of this package with its pickled argument."""
 
-    function: Callable[[Any, Tell], None]
+    function: Work
     argument: bytes
     owner: str = (
         ""  # whose code it runs: different owners never share a runner; "" for this package
@@ -117,9 +118,7 @@ class Workers:
     check: Callable[[], None] = lambda: None  # raises an error once no worker comes back
 
 
-def call(
-    function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell
-) -> Ending | None:
+def call(function: Work, argument: object, limits: Limits, hear: Tell) -> Ending | None:
     """Call a function in an isolated process, which is a copy of this one.
 
     Args:

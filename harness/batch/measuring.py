@@ -1,10 +1,9 @@
 """Metrics of users, computed of the steps of a finished folder in an isolated process."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 from servobench.harness.batch import trials
+from servobench.harness.batch.isolation import Tell
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import offered
 from servobench.harness.run.own_metrics import METRIC_REGISTRY, values_of
@@ -57,7 +56,7 @@ def add_metric(folder: ResultsFolder, place: str) -> str:
     return name
 
 
-def _measure(tell: Callable[[Any], None], name: str, folder: ResultsFolder) -> None:
+def _measure(tell: Tell, name: str, folder: ResultsFolder) -> None:
     """Tell the identifier of each run with its value and why there is none."""
     metric = METRIC_REGISTRY.find(name)
     for run_id, steps in folder.steps().groupby("run_id", sort=False):

@@ -4,7 +4,7 @@ Each file is written atomically, with its checksum before it has its name; `resu
 """
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeAlias
@@ -29,9 +29,9 @@ from servobench.harness.batch.tables import writing
 from servobench.harness.run.result import RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
+from servobench.plant.contract.files import PARTIAL, Write, accessing, write_atomically
 
-Files: TypeAlias = dict[str, Callable[[Path], object]]  # name -> writes the file
+Files: TypeAlias = dict[str, Write]  # name -> writes the file
 
 
 def create_folder(folder: Path, manifest: Manifest) -> None:
@@ -142,5 +142,5 @@ def put_together(folder: ResultsFolder, manifest: Manifest) -> int:
     return count
 
 
-def _text(text: str) -> Callable[[Path], object]:
+def _text(text: str) -> Write:
     return lambda file: file.write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -34,8 +34,8 @@ class Value(NamedTuple):
     """A kind of value that options take: its word in help pages, values that a shell offers, and its check."""
 
     word: str
-    complete: Callable[[str], list[str]] | None = None
-    check: Callable[[str], str] | None = None  # returns the value of a text, or refuses it
+    complete: selection.Complete | None = None
+    check: selection.Choose | None = None  # returns the value of a text, or refuses it
 
     def several(self) -> Value:
         """Return the value of an option that takes a comma-separated list of these."""

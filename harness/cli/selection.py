@@ -16,13 +16,17 @@ if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word
 
 ALL = "all"
+Complete: TypeAlias = Callable[[str], list[str]]  # returns the names that a word may become
+Choose: TypeAlias = Callable[
+    [str], str
+]  # returns the name for which a word stands; refuses a wrong word
 
 
 class Names(NamedTuple):
     """The names of a kind."""
 
     known: Callable[[], Sequence[str]]  # returns all of them
-    choose: Callable[[str], str]  # returns the name for which a word stands; refuses a wrong word
+    choose: Choose
     # Plants or controllers, of which those of third parties are tried if `all` is meant
     tried: Word | None = None
     # Returns the offers for a word, where names have parts
@@ -100,7 +104,7 @@ def _choose_robot(word: str) -> str:
     return word
 
 
-def accepted(find: Callable[[str], object]) -> Callable[[str], str]:
+def accepted(find: Callable[[str], object]) -> Choose:
     """Return a function that returns a word as the name if `find`, which refuses a wrong one, accepts it."""
 
     def choose_word(word: str) -> str:
@@ -110,7 +114,7 @@ def accepted(find: Callable[[str], object]) -> Callable[[str], str]:
     return choose_word
 
 
-def completing(kind: Kind) -> Callable[[str], list[str]]:
+def completing(kind: Kind) -> Complete:
     """Return a function that completes a name of a kind."""
 
     def complete(incomplete: str) -> list[str]:
@@ -121,7 +125,7 @@ def completing(kind: Kind) -> Callable[[str], list[str]]:
     return complete
 
 
-def completing_lists(complete: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
+def completing_lists(complete: Complete) -> Complete:
     """Return a function that completes the last name of a comma-separated list."""
 
     def complete_last(incomplete: str) -> list[str]:
@@ -195,7 +199,7 @@ def split_names(
     option: str,
     text: str,
     known: Sequence[str],
-    choose_one: Callable[[str], str] | None = None,
+    choose_one: Choose | None = None,
     usable: Callable[[], Iterable[str]] | None = None,
 ) -> tuple[str, ...]:
     """Split a comma-separated list of names, and refuse an empty one and a name that stands in it twice.

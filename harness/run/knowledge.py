@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
-from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.fit import Progress, train, training_digest
@@ -15,7 +15,7 @@ from servobench.harness.run.request import RunSettings
 from servobench.harness.run.result import NETWORKS
 from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.lanes import one_thread
-from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.contract.signals import JacobianFunction, PlantSpec
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.parametric import ParametricModel
 from servobench.plant.robot.robot import Robot

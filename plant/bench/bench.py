@@ -35,6 +35,7 @@ from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import (
     BoolArray,
     Command,
+    JacobianFunction,
     Observation,
     Truth,
     trusted_observation,
@@ -485,7 +486,7 @@ class Bench(Plant):
             tool=(mechanics.tool_frequency, mechanics.tool_damping),
         )
 
-    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+    def nominal_jacobian(self) -> JacobianFunction | None:
         """See `Plant.nominal_jacobian`."""
         return self.world.nominal_jacobian()
 

@@ -17,7 +17,14 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, IntArray, Shape, as_array
 from servobench.plant.contract.faults import RunFault
-from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.signals import (
+    BoolArray,
+    Command,
+    JacobianFunction,
+    Observation,
+    PlantSpec,
+    Truth,
+)
 from servobench.plant.robot.arm import JointLimits
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.mechanics import MechanicsConfig
@@ -30,9 +37,7 @@ ImageArray: TypeAlias = npt.NDArray[np.uint8]
 class TrueModel:
     """The kinematics of the true robot and the delays of commands and features; for upper bounds only."""
 
-    jacobian: Callable[
-        [FloatArray], FloatArray
-    ]  # (..., n) rad -> (..., m, n), unit of the feature per rad.
+    jacobian: JacobianFunction
     # from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1)
     symbolic: Callable[[Any], Any]
     latency: float = 0.0  # between exposure and delivery of a frame, s
@@ -92,7 +97,7 @@ class Abilities(ABC):
         """Return the kinematics of the plant's robot with the plant's own delays, as far as it knows them."""
         return model
 
-    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+    def nominal_jacobian(self) -> JacobianFunction | None:
         """Return the public nominal Jacobian of a robot that the plant brings, (..., n) -> (..., m, n); or None."""
         return None
 

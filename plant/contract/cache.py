@@ -20,13 +20,14 @@ import re
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
 from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, read_sums
+from servobench.plant.contract.files import Write
 from servobench.plant.contract.settings import remark
 
 FILES = "files"
@@ -58,7 +59,7 @@ def cache_folder(kind: str) -> Path:
     return next(filter(_is_writable, folders), folders[0])
 
 
-def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
+def cached(kind: str, key: str, make: Write) -> Path:
     """Return the folder with the files of an entry; they are made where they are missing or damaged.
 
     Args:
@@ -178,7 +179,7 @@ def is_whole(entry: Path) -> bool:
     return False
 
 
-def _make_one(entries: list[Path], make: Callable[[Path], object]) -> Path:
+def _make_one(entries: list[Path], make: Write) -> Path:
     """Make the first of several entries whose folder this user may write, and return it."""
     for entry in entries:
         try:
@@ -194,7 +195,7 @@ def _make_one(entries: list[Path], make: Callable[[Path], object]) -> Path:
     return entry
 
 
-def _make(entry: Path, make: Callable[[Path], object]) -> None:
+def _make(entry: Path, make: Write) -> None:
     """Make an entry in a temporary folder and move it to its place; nothing is left where that fails."""
     kind = entry.parent
     if kind.parent == _temporary_cache():

@@ -8,11 +8,11 @@ lines say was changed since. A line without a file says nothing: the process was
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from servobench.plant.contract.files import partial_path, sync, write_text
+from servobench.plant.contract.files import Write, partial_path, sync, write_text
 
 SUMS = "SHA256SUMS"
 # Within the folder
@@ -23,7 +23,7 @@ TABLE_END = b"PAR1"  # the last bytes of a Parquet file
 Sums = Mapping[str, frozenset[str]]
 
 
-def write_vouched(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> None:
+def write_vouched(folder: Path, files: Mapping[str, Write]) -> None:
     """Write files that belong together, and their lines before they have their names.
 
     Args:

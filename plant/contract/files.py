@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
@@ -41,7 +41,10 @@ MAX_NUMBER = 1e30  # beyond which no quantity is, and squares of errors are near
 PARTIAL = re.compile(r"\..+-\d+-\d+")
 
 
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+Write: TypeAlias = Callable[[Path], object]  # makes a file or a folder at a path
+
+
+def write_atomically(path: Path, write: Write) -> None:
     """Write a file under another name in the same folder, then rename it.
 
     Args:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,8 @@ from servobench.plant.contract.checks import (
 )
 
 BoolArray = npt.NDArray[np.bool_]
+# Joint positions (..., n) rad -> (..., m, n), unit of the feature per rad
+JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 JOINT_UNIT = "rad"
 COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
 SETTLING_BAND = 0.005  # share of a feature's natural size: 5 mm on the UR5

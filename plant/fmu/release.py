@@ -7,12 +7,14 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Timer
+from typing import TypeAlias
 
 RELEASE_TIME = 5.0  # [s] for all instances of a run, after which their process is ended
-_delayed: list[list[Callable[[], None]]] = []  # a list for each context
+Act: TypeAlias = Callable[[], None]
+_delayed: list[list[Act]] = []  # a list for each context
 
 
-def release(act: Callable[[], None]) -> None:
+def release(act: Act) -> None:
     """Call `act`, which frees instances: now, or later within a context of `delayed_releases`."""
     if _delayed:
         _delayed[-1].append(act)
@@ -21,9 +23,9 @@ def release(act: Callable[[], None]) -> None:
 
 
 @contextmanager
-def delayed_releases() -> Iterator[Callable[[], None]]:
+def delayed_releases() -> Iterator[Act]:
     """Yield the function that carries out the releases that were asked for so far; the context ends with it, too."""
-    waiting: list[Callable[[], None]] = []
+    waiting: list[Act] = []
 
     def carry_out() -> None:
         if not waiting:

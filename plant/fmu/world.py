@@ -30,7 +30,7 @@ from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Delay, Names, nested, remark, settings
-from servobench.plant.contract.signals import BoolArray, Truth
+from servobench.plant.contract.signals import BoolArray, JacobianFunction, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import (
     NUMERIC,
@@ -357,7 +357,7 @@ class FmuWorld(World):
             self._true = build_model(self._mapping, self.description)
         return TrueModel(self._true.jacobian, self._true.symbolic)
 
-    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+    def nominal_jacobian(self) -> JacobianFunction | None:
         """Return the FMU's Jacobian with the mapping's nominal parameters, or None if it has none."""
         if self._nominal is None:
             return None

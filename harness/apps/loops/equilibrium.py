@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
-from servobench.controllers.controller import Controller, JacobianFunction
+from servobench.controllers.controller import Controller
 from servobench.controllers.servo import Servo, ServoController, ServoState
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.harness.apps.loops.systems import ArmModel, StateSpace
@@ -28,7 +28,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import map_arrays
 from servobench.plant.contract.settings import remark
-from servobench.plant.contract.signals import Observation, trusted_observation
+from servobench.plant.contract.signals import JacobianFunction, Observation, trusted_observation
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
