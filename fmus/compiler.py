@@ -11,6 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from servobench.plant.fmu.dialect import DIALECTS
 
@@ -44,6 +45,7 @@ class Platform:
         return self.name
 
 
+Platforms: TypeAlias = tuple[Platform, ...]
 _LINUX = ("-fPIC", "-Wl,--build-id=none", "-s")
 # The library's own name and the map of its object files would be paths of the machine that compiles.
 _DARWIN = ("-fPIC", "-Wl,-install_name,@rpath/fmu.dylib", "-s")
@@ -77,7 +79,7 @@ def this_platform() -> Platform:
     return PLATFORMS[name]
 
 
-def parse_platforms(text: str | None) -> tuple[Platform, ...]:
+def parse_platforms(text: str | None) -> Platforms:
     """Return the platforms in a comma-separated list; None stands for this machine, "all" for all.
 
     Raises:

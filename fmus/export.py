@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compiler import CODE, Platform, this_platform
+from servobench.fmus.compiler import CODE, Platforms, this_platform
 from servobench.fmus.dialect import export_dialect
 from servobench.fmus.model_description import Description, exporter
 from servobench.fmus.product import Product, c_files, documentation, word
@@ -58,9 +58,7 @@ class ExportOptions:
     # Arm, cameras and home that become start values, and the step of default experiment and reference run.
     setup: PlantSetup = field(default_factory=nominal_setup)
     config: KinematicConfig = field(default_factory=KinematicConfig)  # lag, limits and mechanics
-    platforms: tuple[Platform, ...] = field(
-        default_factory=lambda: (this_platform(),)
-    )  # to compile for
+    platforms: Platforms = field(default_factory=lambda: (this_platform(),))  # to compile for
     # Text for the documentation that says how the model differs from the nominal one.
     mismatch: str = "none"
 

@@ -6,7 +6,7 @@ equal models give equal bytes.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import chain
@@ -32,7 +32,7 @@ from servobench.fmus.variables import (
     Group,
     Layout,
 )
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import NamedArrays
 from servobench.plant.contract.facts import read_beside
 
 _TABLES = read_beside(__file__, "model_description.toml")
@@ -60,7 +60,7 @@ class Description:
     summary: str  # one sentence
     layout: Layout  # the variables
     # Start values of parameters and inputs, flat arrays by group; all others are zero.
-    start: Mapping[str, FloatArray]
+    start: NamedArrays
     sources: tuple[str, ...]  # C files to compile, in order
     step: float  # [s] step of the default experiment
     exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation

@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from uuid import UUID
 
-from servobench.fmus.compiler import Platform, compile_library, library_files
+from servobench.fmus.compiler import Platforms, compile_library, library_files
 from servobench.fmus.dialect import ExportDialect, export_dialect
 from servobench.fmus.model_description import (
     REFERENCES,
@@ -111,7 +111,7 @@ class Product:
             "documentation/licenses/license.txt": committed("ur5_mismatched", "license.txt"),
         }
 
-    def write(self, path: Path, platforms: tuple[Platform, ...]) -> Path:
+    def write(self, path: Path, platforms: Platforms) -> Path:
         """Write the FMU atomically.
 
         Args:
@@ -135,9 +135,7 @@ class Product:
         write_archive(path, contents)
         return path
 
-    def _libraries(
-        self, contents: Mapping[str, bytes], platforms: tuple[Platform, ...]
-    ) -> dict[str, bytes]:
+    def _libraries(self, contents: Mapping[str, bytes], platforms: Platforms) -> dict[str, bytes]:
         """Return the libraries by their path in the archive, compiled from the sources among its files."""
         identifier = self.description.model_identifier
         with tempfile.TemporaryDirectory(prefix="servobench-export-") as name:

@@ -2,14 +2,13 @@
 
 import csv
 import io
-from collections.abc import Mapping
 
 import numpy as np
 
 from servobench.fmus.variables import BALL, FEATURE, INPUT, SEEN, Layout
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, NamedArrays
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 
@@ -19,7 +18,7 @@ OUTPUT_FILE = "extra/servobench/reference_output.csv"
 COMMAND = "joint_velocity_command"
 
 
-def tables(run: Mapping[str, FloatArray], layout: Layout) -> tuple[str, str]:
+def tables(run: NamedArrays, layout: Layout) -> tuple[str, str]:
     """Return the inputs and all other variables of a run as CSV.
 
     Args:
@@ -39,7 +38,7 @@ def tables(run: Mapping[str, FloatArray], layout: Layout) -> tuple[str, str]:
     return table(time, inputs, layout), table(time, others, layout)
 
 
-def reference_run(setup: PlantSetup, config: KinematicConfig) -> dict[str, FloatArray]:
+def reference_run(setup: PlantSetup, config: KinematicConfig) -> NamedArrays:
     """Return the reference run of the kinematic plant; some of its commands exceed the speed limit."""
     world = KinematicWorld(config, setup)
     limit = world.spec.command.upper
@@ -79,7 +78,7 @@ def read_table(text: str) -> tuple[list[str], FloatArray]:
     return rows[0], np.array([[float(cell) for cell in row] for row in rows[1:]])
 
 
-def table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -> str:
+def table(time: FloatArray, columns: NamedArrays, layout: Layout) -> str:
     """Return values by name, (k, size), as CSV with one column for each scalar."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

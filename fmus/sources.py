@@ -30,7 +30,7 @@ from servobench.plant.cameras.symbolic import (
     symbolic_rotation,
     valid_features,
 )
-from servobench.plant.contract.checks import AnyArray, FloatArray, Shape
+from servobench.plant.contract.checks import AnyArray, NamedArrays, Shape
 from servobench.plant.robot.mechanics import FREQUENCIES, MAX_PART
 
 IN_MACROS = {ord("("): "_", ord(")"): ""}  # DER(BALL) is DER_BALL there
@@ -61,7 +61,7 @@ def generated_source(name: str, functions: Iterable[Any]) -> str:
 
 
 def layout_header(
-    layout: Layout, start: Mapping[str, FloatArray], constants: Mapping[str, float], token: str
+    layout: Layout, start: NamedArrays, constants: Mapping[str, float], token: str
 ) -> str:
     """Return the C header with sizes, offsets, start values and minima.
 

@@ -21,7 +21,7 @@ import numpy as np
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.optics import COLUMNS
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
-from servobench.plant.contract.checks import FloatArray, Shape
+from servobench.plant.contract.checks import FloatArray, NamedArrays, Shape
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
@@ -81,6 +81,9 @@ class Group:
             if self.role == DERIVATIVE:
                 scalar = f"der({scalar})"
             yield scalar
+
+
+Groups = tuple[Group, ...]
 
 
 class View(NamedTuple):
@@ -150,7 +153,7 @@ def read_groups(
     sizes: Mapping[str, int],
     words: Mapping[str, str],
     parts: Collection[str] = ("",),
-) -> tuple[Group, ...]:
+) -> Groups:
     """Return the groups of a model in the order of the flat vector.
 
     Args:
@@ -181,7 +184,7 @@ def read_groups(
     return tuple(groups)
 
 
-def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
+def arm_groups(n: int, view: View | None = None) -> Groups:
     """Return the groups of an arm with `n` joints, in the order of the flat vector.
 
     The kinematic parameters come first and in the order in which the generated core takes them.
@@ -202,7 +205,7 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
 class Layout:
     """The groups and their offsets in the flat vector of values."""
 
-    groups: tuple[Group, ...]  # all variables of the model
+    groups: Groups  # all variables of the model
 
     @cached_property
     def by_name(self) -> dict[str, Group]:
@@ -266,7 +269,7 @@ def parameters_of(setup: PlantSetup, config: KinematicConfig) -> dict[str, Float
     }
 
 
-def _arm_parameters(arm: SerialArm) -> dict[str, FloatArray]:
+def _arm_parameters(arm: SerialArm) -> NamedArrays:
     """Return the values of the kinematic parameters of an arm by name, (..., size).
 
     Its first transform leads to joint 1, the others from joint i to joint i + 1.
@@ -283,7 +286,7 @@ def _arm_parameters(arm: SerialArm) -> dict[str, FloatArray]:
     }
 
 
-def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
+def _sensing_parameters(model: RobotModel) -> NamedArrays:
     """Return the values of the parameters of target and cameras by name, (..., size)."""
     if not isinstance(model, SetupModel):
         return {"tool": model.arm.tool, **_camera_parameters(model.camera)}
@@ -299,7 +302,7 @@ def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
     return {**flat, "focal_length": optics.focal, "distortion": optics.distortion}
 
 
-def _camera_parameters(X_BC: FloatArray) -> dict[str, FloatArray]:
+def _camera_parameters(X_BC: FloatArray) -> NamedArrays:
     """Return position and angles of cameras, (..., 3), by name."""
     angles = rpy_from_rotation(X_BC[..., :3, :3])
     return {"camera_position": X_BC[..., :3, 3], "camera_rpy": angles}

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, final
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 
@@ -110,6 +110,10 @@ class Known(NamedTuple):
     moves: IntArray  # the regression's, (...)
 
 
+Past: TypeAlias = tuple[Known, ...]
+"""The last `HORIZON` frames, the oldest first."""
+
+
 class CalibrationState(NamedTuple):
     """The state of the stage."""
 
@@ -133,7 +137,7 @@ class CalibrationState(NamedTuple):
     moves: IntArray  # those of the regression at the last frame, (...)
     passed: IntArray  # frames since the last iteration, (...)
     spawned: IntArray  # members begun so far, and iterations of other ripples, (...)
-    past: tuple[Known, ...]  # the last `HORIZON` frames, the oldest first
+    past: Past
 
     @property
     def fitted(self) -> BoolArray:
@@ -261,7 +265,7 @@ class Calibration:
         state: CalibrationState,
         observation: Observation,
         regression: Regressed,
-        past: tuple[Known, ...],
+        past: Past,
         late: FloatArray | None,
     ) -> CalibrationState:
         """Return the state with a frame more, by which earlier predictions are judged."""
@@ -451,7 +455,7 @@ class Calibration:
         path: FloatArray,
         instant: FloatArray,
         delay: FloatArray,
-        past: tuple[Known, ...],
+        past: Past,
     ) -> tuple[CalibrationState, BoolArray]:
         """Judge the predictions of a frame by what was known `HORIZON` frames before.
 
@@ -530,11 +534,11 @@ class Calibration:
 
     def _remembered(
         self,
-        past: tuple[Known, ...],
+        past: Past,
         state: CalibrationState,
         due: BoolArray,
         regression: Regressed,
-    ) -> tuple[Known, ...]:
+    ) -> Past:
         """Return what is known at the last frames, with this one where it is due."""
         # Members become fewer at the same time in all lanes, whether a frame is due or not.
         same_size = bool(past) and past[-1].share.shape == state.share.shape

@@ -1,6 +1,5 @@
 """Exports a controller as a co-simulation FMU: a recorded step, its variables, its reference run."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +9,8 @@ from servobench.fmus.controllers.record import Recorded
 from servobench.fmus.model_description import Description
 from servobench.fmus.product import Product, c_files, documentation, word
 from servobench.fmus.reference import tables
-from servobench.fmus.variables import SAMPLED, Group, Layout, read_groups
-from servobench.plant.contract.checks import FloatArray
+from servobench.fmus.variables import SAMPLED, Groups, Layout, read_groups
+from servobench.plant.contract.checks import NamedArrays
 
 MODEL = "controller"
 CORE = "controller"
@@ -24,7 +23,7 @@ COMMAND = "joint_velocity_command"
 JACOBIAN = "jacobian"
 
 
-def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]:
+def controller_groups(n: int, m: int, rows: int, unit: str) -> Groups:
     """Return the variables of a controller.
 
     Args:
@@ -43,10 +42,10 @@ class ControllerModel:
     name: str  # by which it is known
     summary: str  # one line
     recorded: Recorded  # its step, of the columns [time, inputs]
-    groups: tuple[Group, ...]  # from `controller_groups`
+    groups: Groups  # from `controller_groups`
     period: float  # s
     # A run of the original: time, inputs and the outputs for them by name, (k, size).
-    run: Mapping[str, FloatArray]
+    run: NamedArrays
     settings: str  # settings of the original, for the documentation
 
     @property
@@ -54,7 +53,7 @@ class ControllerModel:
         """Name of the libraries."""
         return word(self.name, "controller")
 
-    def product(self, fmi_version: int, start: Mapping[str, FloatArray] | None = None) -> Product:
+    def product(self, fmi_version: int, start: NamedArrays | None = None) -> Product:
         """Return the content of the FMU.
 
         Args:

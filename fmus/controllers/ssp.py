@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 
-from servobench.fmus.compiler import Platform
+from servobench.fmus.compiler import Platforms
 from servobench.fmus.controllers.export import COMMAND, FEATURE, POSITION, SEEN
 from servobench.fmus.model_description import UNITS, exporter, xml_bytes
 from servobench.fmus.product import Product, write_archive
@@ -19,7 +19,7 @@ CONTROLLER = "controller"
 
 
 def write_loop(
-    path: Path, plant: Product, controller: Product, platforms: tuple[Platform, ...], stop: float
+    path: Path, plant: Product, controller: Product, platforms: Platforms, stop: float
 ) -> Path:
     """Write the closed loop of two products of FMI 2.
 

@@ -19,7 +19,7 @@ from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, NamedArrays
 from servobench.plant.robot.mismatch import Mismatch
 
 PERIODS = 10  # length of the short run
@@ -30,7 +30,7 @@ UFUNCS = (np.sin, np.cos, np.exp, np.log, np.arctan)
 
 
 @cache
-def elementary() -> dict[str, FloatArray]:
+def elementary() -> NamedArrays:
     """Return values of the C library, of numpy's vector functions and of BLAS and LAPACK, by name."""
     x = np.linspace(0.1, 4.0, 64)
     A = np.arange(64.0).reshape(8, 8) % 7.0 + 8.0 * np.eye(8)
@@ -55,7 +55,7 @@ def roll_out(plant: str, controller: str) -> FloatArray:
     return np.hstack([steps.joint_position, steps.true_feature, steps.command])
 
 
-def numbers(plants: Iterable[str], controllers: Iterable[str]) -> dict[str, FloatArray]:
+def numbers(plants: Iterable[str], controllers: Iterable[str]) -> NamedArrays:
     """Return `elementary`, and a roll-out of each plant and of each controller of this package, by name."""
     values = dict(elementary())
     for name in plants:

@@ -37,6 +37,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch
 
 Floats32: TypeAlias = npt.NDArray[np.float32]
+Info: TypeAlias = dict[str, Any]  # facts, or options, by name
 FEATURE_BOUND = 10.0  # natural sizes, beyond which features and errors are clipped
 LATENESS_BOUND = 2.0  # [s] beyond which the lateness of a frame is clipped
 
@@ -235,8 +236,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         return self._rollout.observation
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats32, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Floats32, Info]:
         """Begin a run.
 
         Args:
@@ -273,7 +274,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self._spaces.begin(observation)
         return self._observe(self._rollout), info
 
-    def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, dict[str, Any]]:
+    def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, Info]:
         """Hold an action for a period.
 
         Args:
@@ -455,8 +456,8 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Floats32, dict[str, Any]]:
+        options: Info | None = None,
+    ) -> tuple[Floats32, Info]:
         """Begin a run in every lane.
 
         Args:
@@ -506,7 +507,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
 
     def step(
         self, actions: npt.ArrayLike
-    ) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+    ) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, Info]:
         """Hold an action in every lane for a period; see `ServoEnv.step`, but without `reason`.
 
         Args:

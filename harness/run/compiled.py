@@ -7,7 +7,6 @@ beside others.
 
 import contextlib
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from servobench.fmus.controllers.export import (
     SEEN,
     controller_groups,
 )
-from servobench.fmus.controllers.record import Recorded, record
+from servobench.fmus.controllers.record import Inputs, Recorded, record
 from servobench.fmus.variables import INPUT
 from servobench.harness.config.registry import find_controller, is_foreign_controller
 from servobench.harness.config.source import PACKAGE_FOLDER
@@ -95,19 +94,17 @@ def _classes(controller: Controller) -> tuple[type, ...]:
     return type(servo.estimation.estimator), type(servo.law), type(servo.initial)
 
 
-def _observation(inputs: Mapping[str, Any]) -> Observation:
+def _observation(inputs: Inputs) -> Observation:
     valid = inputs[SEEN]
     both = inputs[POSITION], inputs[FEATURE]
     return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
 
 
-def _start(servo: Servo, inputs: Mapping[str, Any]) -> ServoState:
+def _start(servo: Servo, inputs: Inputs) -> ServoState:
     return servo.start(_observation(inputs))
 
 
-def _step(
-    servo: Servo, state: ServoState, inputs: Mapping[str, Any]
-) -> tuple[ServoState, FloatArray]:
+def _step(servo: Servo, state: ServoState, inputs: Inputs) -> tuple[ServoState, FloatArray]:
     """Return the new state, and command and Jacobian in one row."""
     state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
     jacobian = servo.jacobian(state)

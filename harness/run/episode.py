@@ -29,7 +29,7 @@ from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, INSTANT, Ending, RunResult, ends_batch
 from servobench.harness.run.sampling import Drawn, draw_once
 from servobench.plant.bench.bench import Bench
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import NamedArrays
 from servobench.plant.contract.faults import RunFault
 
 ROWS_AT_ONCE = 2**18  # rows in the logs of runs side by side, half a kilobyte each
@@ -154,7 +154,7 @@ def _judge_together(
     return results
 
 
-def _judge(logged: Steps, experiment: Experiment) -> dict[str, FloatArray]:
+def _judge(logged: Steps, experiment: Experiment) -> NamedArrays:
     """Return the metrics of a run or of runs side by side; none without rows."""
     task = experiment.scenario
     if len(logged):
@@ -168,7 +168,7 @@ def _row(
     ending: Ending,
     metrics: Mapping[str, npt.ArrayLike],
     logged: Steps,
-    pose: Mapping[str, FloatArray],
+    pose: NamedArrays,
 ) -> dict[str, Any]:
     """Return the row of a run in the table of runs."""
     spec = logged.spec

@@ -20,7 +20,7 @@ from servobench.harness.config.registry import DECLARED
 from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.harness.run.scenario import Span
-from servobench.plant.contract.checks import AnyArray, FloatArray, IntArray
+from servobench.plant.contract.checks import AnyArray, FloatArray, IntArray, NamedArrays
 from servobench.plant.contract.lanes import norm
 
 SETTLING_SHARE = 0.05  # band as a share of the initial error
@@ -117,7 +117,7 @@ def judge_run(
     evaluate_from: float,
     lap_time: float = math.nan,
     moves: Sequence[Span] = (),
-) -> dict[str, FloatArray]:
+) -> NamedArrays:
     """Return the metrics of a run, or of runs side by side.
 
     Args:

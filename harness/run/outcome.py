@@ -24,7 +24,7 @@ from servobench.harness.run.metrics import move_times
 from servobench.harness.run.references import ImageReference, Reference
 from servobench.harness.run.scenario import Scenario
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, NamedArrays
 from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.inverse import closest_distance
@@ -103,9 +103,7 @@ def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, ba
     return bool((distances > band).any())
 
 
-def pose_errors(
-    robot: RobotModel | None, reference: Reference, steps: Steps
-) -> dict[str, FloatArray]:
+def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> NamedArrays:
     """Return distance and angle of the target from its reference pose, (k,), as columns; none where not judged.
 
     Where the camera is moved during the run, the target is still judged by its taught pose.

@@ -1,6 +1,7 @@
 """Checks of arrays and numbers at the boundary of a function."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
 AnyArray = npt.NDArray[Any]
+NamedArrays: TypeAlias = Mapping[str, FloatArray]
 Shape: TypeAlias = tuple[int, ...]  # sizes of axes, often of the leading ones alone
 REAL = "fiub"  # kinds of arrays, as numpy names them
 

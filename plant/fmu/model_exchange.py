@@ -14,7 +14,7 @@ import casadi
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, NamedArrays
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping
@@ -71,7 +71,7 @@ class FmuModel:
 def build_model(
     mapping: FmuMapping,
     description: FmuDescription,
-    parameters: Mapping[str, FloatArray] | None = None,
+    parameters: NamedArrays | None = None,
 ) -> FmuModel:
     """Return the model of a mapped FMU.
 

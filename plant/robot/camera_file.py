@@ -60,6 +60,7 @@ IN_STEP = 2e-4  # [1]
 MAX_ROUNDED = 0.015  # [1]
 ROUNDED = 1e-3  # largest error of a rotation whose numbers were rounded
 Row = tuple[Number, ...]
+Lens = tuple[str, tuple[float, ...]]  # its model, a key of `LENSES`, and its coefficients [1]
 
 
 @settings
@@ -333,7 +334,7 @@ def _matrix(keys: CameraFile) -> FloatArray:
     return K
 
 
-def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
+def _lens(keys: CameraFile) -> Lens:
     """Return the model of the lens, a key of `LENSES`, and its coefficients."""
     given = keys.distortion
     values = list(given)
@@ -374,7 +375,7 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
     return _least_lens(lens, (*given, *zeros)[:wanted])
 
 
-def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tuple[float, ...]]:
+def _named_coefficients(lens: str, given: Mapping[str, float]) -> Lens:
     """Return the model of the lens, empty where the file does not say it, and coefficients that are given by name."""
     if not lens and {"k4", "k5", "k6"} <= set(given):
         lens = "rational_polynomial"
@@ -387,7 +388,7 @@ def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tup
     return _least_lens(lens, tuple(given.get(name, 0.0) for name in LENSES[lens]))
 
 
-def _least_lens(lens: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+def _least_lens(lens: str, coefficients: tuple[float, ...]) -> Lens:
     """Return a lens of the rational model without denominator as one of the usual model."""
     if lens == "rational_polynomial" and not any(coefficients[5:]):
         return "plumb_bob", coefficients[:5]

@@ -42,6 +42,7 @@ TARGET = ("target_x", "target_y", "target_z")
 ALIGNMENT = 0.002  # [m²] weight of the planned rotation in `placed`
 POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 AXES = np.eye(3)
+Rotations = list[list[list[float]] | None]  # the rows of each; None for no rotation
 
 
 class Vectors(NamedTuple):
@@ -240,10 +241,10 @@ class ParametricModel:
         return lengths
 
     @cached_property
-    def _rotations(self) -> list[list[list[float]] | None]:
-        """The rows of the fixed rotation before each joint and the flange; None for no rotation."""
+    def _rotations(self) -> Rotations:
+        """The fixed rotation before each joint and the flange."""
         # A quarter turn has entries of 6e-17, which would cost as much as others.
-        rotations: list[list[list[float]] | None] = []
+        rotations: Rotations = []
         for rotation in np.round(rotation_from_rpy(self.planned.arm.rpy), 15):
             rows = None
             if not np.array_equal(rotation, AXES):
@@ -252,7 +253,7 @@ class ParametricModel:
         return rotations
 
     @cached_property
-    def _opposite(self) -> list[list[list[float]] | None]:
+    def _opposite(self) -> Rotations:
         """The opposite rotations."""
         return [each and np.transpose(each).tolist() for each in self._rotations]
 

@@ -44,6 +44,7 @@ LENS = ("focal", "centre_u", "centre_v", "distortion")
 MAX_DEVIATION = 0.5  # [s, m, rad or 1] usual largest deviation of a parameter
 MIN_LENGTH = 1e-6  # [m] a shorter part of a translation is no length
 Rows = tuple[tuple[Number, ...], ...]
+Parameters = Mapping[str, float]  # values by the names of `parameter_names`
 
 
 def parameter_names(arm: SerialArm) -> tuple[str, ...]:
@@ -60,7 +61,7 @@ def links_of(arm: SerialArm) -> Iterator[tuple[str, int, int]]:
         yield f"link_{row}_{'xyz'[axis]}", row, axis
 
 
-def deviated(model: RobotModel, values: Mapping[str, float]) -> RobotModel:
+def deviated(model: RobotModel, values: Parameters) -> RobotModel:
     """Return a model with the deviations of its parameters by name; one that is left out is 0."""
 
     def given(*names: str) -> FloatArray:

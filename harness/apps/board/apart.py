@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from multiprocessing.connection import Connection, Pipe
 from queue import SimpleQueue
-from typing import Any, final
+from typing import Any, TypeAlias, final
 
 import numpy as np
 
@@ -41,8 +41,9 @@ from servobench.plant.contract.signals import Command, Observation
 DECOY = 1_000_003  # from the seed of a run to that of the other robot
 LIMIT = 600.0  # [s] for an answer
 
+Reply: TypeAlias = dict[str, Any]  # JSON values by name
 # Asks a method of the isolated controller
-Ask = Callable[..., dict[str, Any]]
+Ask = Callable[..., Reply]
 
 
 @final
@@ -51,7 +52,7 @@ class _Remote(Controller):
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
-        self._answer: dict[str, Any] = {}
+        self._answer: Reply = {}
 
     def reset(self, observation: Observation, seed: int) -> None:
         """See `Controller.reset`."""
@@ -101,14 +102,14 @@ def carry_out_apart(folder: ResultsFolder, row: Row, code: Code) -> tuple[RunRes
             case _:
                 answers.put(told)
 
-    def listen() -> dict[str, Any]:
-        answer: dict[str, Any] | Future[tuple[Any, str]] = answers.get()
+    def listen() -> Reply:
+        answer: Reply | Future[tuple[Any, str]] = answers.get()
         if isinstance(answer, Future):  # it has ended too early
             _, failure = answer.result()
             raise ConfigurationError(f"controller {name}: {failure}")
         return answer
 
-    def ask(*call: object) -> dict[str, Any]:
+    def ask(*call: object) -> Reply:
         ours.send(call)
         return listen()
 
@@ -145,7 +146,7 @@ def _be_controller(tell: Tell, link: int, folder: ResultsFolder, row: Row, code:
             tell(_answer(controller, getattr(controller, method)(*arguments)))
 
 
-def _answer(controller: Controller, command: Command | None) -> dict[str, Any]:
+def _answer(controller: Controller, command: Command | None) -> Reply:
     """Return the result of a step, and what the log has of the controller, as JSON values; nothing for a reset."""
     if command is None:
         return {}

@@ -5,14 +5,14 @@
 """
 
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from importlib.resources import as_file, files
 from typing import NamedTuple
 
 import numpy as np
 
 from servobench.harness.config.installation import blas_libraries, installed_version
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import NamedArrays
 
 REFERENCE = files("servobench.harness.apps.board") / "reference.npz"
 MACHINE = "machine"  # entry with the description
@@ -49,14 +49,14 @@ def describe_machine() -> str:
     return " ".join(words)
 
 
-def read_reference() -> tuple[str, dict[str, FloatArray]]:
+def read_reference() -> tuple[str, NamedArrays]:
     """Return the description of the machine of the reference, and its numbers by name."""
     with as_file(REFERENCE) as file, np.load(file) as stored:
         values = dict(stored)
     return str(values.pop(MACHINE)), values
 
 
-def compare(values: Mapping[str, FloatArray], wanted: Mapping[str, FloatArray]) -> Iterator[Part]:
+def compare(values: NamedArrays, wanted: NamedArrays) -> Iterator[Part]:
     """Yield the result about each part; the reference has all of them."""
     for name, own in values.items():
         apart = np.abs(own - wanted[name])

@@ -6,7 +6,6 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -24,6 +23,7 @@ from servobench.harness.apps.figures.style import (
     TEXT,
     WIDE,
     Layout,
+    Look,
     MethodStyle,
     Styles,
     add_legend,
@@ -264,7 +264,7 @@ def same_curves(values: Curves) -> list[list[str]]:
 def _draw_line(
     axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle, name: str, top: float
 ) -> None:
-    look: dict[str, Any] = {
+    look: Look = {
         "color": style.colour,
         "markerfacecolor": style.face,
         "markersize": 4.5,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -66,9 +66,10 @@ FEW_DECADES = 50.0
 LETTER = 0.066  # [in] width of a letter of the legend
 SAMPLE = 0.55  # [in] width of the sample line of a legend
 MARGIN = 0.2  # [in] on both sides of the legend
-DESIRED: dict[str, Any] = _SHEET["desired"]
-BOX: dict[str, Any] = _SHEET["box"]  # around words in a panel
-MARKS_OF: dict[str, dict[str, Any]] = _SHEET["marks"]
+Look: TypeAlias = dict[str, Any]  # arguments of an artist of matplotlib
+DESIRED: Look = _SHEET["desired"]
+BOX: Look = _SHEET["box"]  # around words in a panel
+MARKS_OF: dict[str, Look] = _SHEET["marks"]
 DASHED = (0, (3.5, 1.5))  # line of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 
@@ -141,7 +142,7 @@ class MethodStyle:
         """Colour with which marks are filled."""
         return "white" if self.hollow else self.colour
 
-    def line_arguments(self, points: int) -> dict[str, Any]:
+    def line_arguments(self, points: int) -> Look:
         """Return keyword arguments for a matplotlib line of `points` points, with about eight markers on it."""
         step = max(1, points // MARKS)
         first = int(self.shift * step)
@@ -154,7 +155,7 @@ class MethodStyle:
             **_SHEET["line"],
         }
 
-    def path_arguments(self, points: FloatArray) -> dict[str, Any]:
+    def path_arguments(self, points: FloatArray) -> Look:
         """Return keyword arguments for a line through `points`, (k, d), with about eight markers evenly along it."""
         way = way_along(points)
         places = (np.arange(MARKS) + self.shift) / MARKS * way[-1]

@@ -24,6 +24,7 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.analysis.comparison import FROM_TWIN
 from servobench.harness.apps.figures.responses import mark_settling_band
 from servobench.harness.apps.figures.style import (
+    Look,
     figure_style,
     method_styles,
     plain_logarithms,
@@ -258,7 +259,7 @@ class _Board:
         """Write what is below the camera's picture: its title, the place of the numbers, a legend of the trails."""
         left = VIEW_WIDTH / WIDTH + 0.02
         top = 1 - (HEAD + CAMERA_HEIGHT + 10) / HEIGHT
-        below: dict[str, Any] = {"fontsize": TYPE, "va": "top"}
+        below: Look = {"fontsize": TYPE, "va": "top"}
         self._figure.text(left, top, "the camera's view", **below)
         self._numbers = self._figure.text(
             left,

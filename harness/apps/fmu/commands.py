@@ -17,7 +17,7 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.files import accessing
 
 if TYPE_CHECKING:
-    from servobench.fmus.compiler import Platform
+    from servobench.fmus.compiler import Platforms
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
 
@@ -45,7 +45,7 @@ class Export:
     ] = None
 
     @contextlib.contextmanager
-    def compiling(self) -> Iterator[tuple[Platform, ...]]:
+    def compiling(self) -> Iterator[Platforms]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
         from servobench.fmus.compiler import parse_platforms
 

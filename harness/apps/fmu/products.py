@@ -35,7 +35,7 @@ from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sect
 from servobench.harness.run.sampling import draw, draw_robot
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, NamedArrays
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import find_robot, short_name
@@ -137,7 +137,7 @@ def _repeated_periods(
     return int(np.argmin(whole <= 0.1 * TOLERANCE))
 
 
-def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray]]:
+def _run(experiment: Experiment) -> tuple[NamedArrays, list[FloatArray]]:
     """Carry out the run that the FMU repeats for comparison, with seed 0; it may end early.
 
     No camera is moved, and lost features do not end it.

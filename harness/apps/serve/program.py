@@ -25,6 +25,7 @@ SCRIPT_START = re.compile(rb"def [A-Za-z_]\w*\(")
 COMMAND = "input_int_register_0"
 COMMANDS = CONTROLLER["commands"]["names"].split()
 WITHOUT_ANSWER = frozenset(CONTROLLER["commands"]["without_answer"])
+Motion = Iterator[FloatArray]  # joint velocities [rad/s] of each period
 STOP_DECELERATION = 10.0  # [rad/s²] deceleration of an arm whose program ended
 LONGEST_MOVE = 300.0  # [s] with its settling
 POSITION_GAIN = 5.0  # [1/s] gain of moveJ with which such a drive does not swing
@@ -97,7 +98,7 @@ class ControlProgram:
         self.stopped_at: float | None = None
         self._rest: FloatArray = np.zeros(spec.n)
         self.velocity = self.joints = self._rest
-        self._actions: dict[int, Callable[[], Iterator[FloatArray] | None]] = {
+        self._actions: dict[int, Callable[[], Motion | None]] = {
             1: self._move, 9: self._speed, 11: self._servo, 15: self._halt, 16: self._halt, 35: self._watch,
             31: lambda: self.protect("asked for"), 99: lambda: None, 255: lambda: self.stop("by its client"),
         }  # fmt: skip
@@ -112,7 +113,7 @@ class ControlProgram:
         self._executing = False
         self._silence = 0
         self._watchdog = math.inf
-        self._motion: Iterator[FloatArray] | None = self._ramp(self._rest, STOP_DECELERATION)
+        self._motion: Motion | None = self._ramp(self._rest, STOP_DECELERATION)
 
     def stop(self, why: str) -> None:
         """End the program and bring the arm to rest, with a line for the user."""
@@ -213,7 +214,7 @@ class ControlProgram:
             )
         return target
 
-    def _move(self) -> Iterator[FloatArray]:
+    def _move(self) -> Motion:
         """Move along a trapezoidal profile, corrected by the distance from its present point."""
         if self.inputs.get("input_int_register_1", 0):
             raise ValueError("asynchronous moves are not served")
@@ -228,7 +229,7 @@ class ControlProgram:
             raise ValueError(f"its move must take less than {LONGEST_MOVE:g} s, got {duration:g} s")
         self.busy = True
 
-        def along() -> Iterator[FloatArray]:
+        def along() -> Motion:
             for k in range(math.ceil(LONGEST_MOVE / period)):
                 if k * period >= duration:
                     if np.abs(target - self.joints).max() < POSITION_TOLERANCE:
@@ -247,24 +248,22 @@ class ControlProgram:
 
         return along()
 
-    def _speed(self) -> Iterator[FloatArray]:
+    def _speed(self) -> Motion:
         limit = self._spec.joint_velocity_limit
         wanted = np.clip(self._numbers(0, self._spec.n), -limit, limit)
         return self._ramp(wanted, self._rate("acceleration", 6), forever=True)
 
-    def _servo(self) -> Iterator[FloatArray]:
+    def _servo(self) -> Motion:
         """Approach a position with the look-ahead time as time constant."""
         target = self._reachable()
         time_constant = max(self._rate("lookahead_time", 9), self._spec.period)
         return ((target - self.joints) / time_constant for _ in count())
 
-    def _halt(self) -> Iterator[FloatArray]:
+    def _halt(self) -> Motion:
         self.busy = True
         return self._ramp(self._rest, self._rate("deceleration", 0))
 
-    def _ramp(
-        self, target: FloatArray, acceleration: float, *, forever: bool = False
-    ) -> Iterator[FloatArray]:
+    def _ramp(self, target: FloatArray, acceleration: float, *, forever: bool = False) -> Motion:
         """Yield velocities from the present one to a target; the joint that changes most has the acceleration."""
         change = math.inf if self._lockstep else acceleration * self._spec.period
         while forever or self.velocity.any():

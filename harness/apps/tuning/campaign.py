@@ -45,7 +45,7 @@ from servobench.harness.batch.lock import LOCK
 from servobench.harness.config.description import toml
 from servobench.harness.config.installation import read_checkout
 from servobench.harness.config.registry import offered
-from servobench.harness.config.settings import default_config, file_stem, flatten
+from servobench.harness.config.settings import Section, default_config, file_stem, flatten
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, write_text
 from servobench.plant.contract.settings import Count, Periods, settings
@@ -84,7 +84,7 @@ class RunningStudy:
         self.asked = 0
         self.outcome: StudyRecord | None = None
         self._course = course
-        self.wanted: Mapping[str, Any] | None = nested_settings(next(course))
+        self.wanted: Section | None = nested_settings(next(course))
 
     def advance(self, ledger: Ledger) -> None:
         """Go on up to a point that the ledger does not know, or to the end."""
@@ -147,7 +147,7 @@ class Method:
         """Return the results of the studies that have ended."""
         return [each.outcome for each in self.studies if each.outcome is not None]
 
-    def _scored(self) -> list[Mapping[str, Any]]:
+    def _scored(self) -> list[Section]:
         """Return the defaults and the values in use, as far as they were scored: a study may have a single trial."""
         return [each for each in self._known if self.ledger.costs(each) is not None]
 
@@ -288,7 +288,7 @@ class TunedValues:
     second_score_of_defaults: float
     checked_score: float  # score of these values on the subset `TuningSet.checked`
     checked_score_of_defaults: float
-    settings: Mapping[str, Any]  # nested values
+    settings: Section  # nested values
     # Empty for values that were found under another objective and only scored anew.
     studies: tuple[StudyRecord, ...]
     # A line for each number at an edge of its box, which is wider in the next study
@@ -304,7 +304,7 @@ class TunedValues:
         return math.isclose(self.second_score, WORST)
 
 
-def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
+def edge_lines(name: str, nested: Section) -> tuple[str, ...]:
     """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
     values = flatten(nested)
     boxes: dict[str, Any] = dict(find_space(name))

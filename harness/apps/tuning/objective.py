@@ -41,6 +41,7 @@ from servobench.harness.batch.plan import Cell, Survey, tuning_seeds
 from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import (
     TUNING,
+    Section,
     Settings,
     apply_settings,
     file_stem,
@@ -51,7 +52,7 @@ from servobench.harness.run.rehearsal import build_once
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
-from servobench.harness.run.variations import Varied
+from servobench.harness.run.variations import Row, Varied
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.files import accessing
 from servobench.plant.contract.seeds import named_generator
@@ -62,7 +63,7 @@ from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
 MOVE = "random"
 # Settings of the tasks, short because a settled run needs no more time
-TASKS: Mapping[str, Mapping[str, Any]] = {
+TASKS: Mapping[str, Section] = {
     MOVE: {"duration": 6.0},
     "circle": {"radius": 0.17, "lap_time": 5.0},  # at 0.21 m/s, the whole task at 0.19 m/s
     "lemniscate": {"radius": 0.14, "lap_time": 5.0},
@@ -246,7 +247,7 @@ class Trial:
         build_once(self.resolved(runs[:1])[0])
 
 
-def run_cost(task: str, row: Mapping[str, Any]) -> float:
+def run_cost(task: str, row: Row) -> float:
     """Return the weighted cost of one run from its row of results; see the module's docstring."""
     weight = WEIGHTS[task]
     if row["status"] != COMPLETED:
@@ -294,7 +295,7 @@ def evaluate(
 
 
 SECOND = ".second"  # in the name of the ledger of the second set
-Wanted: TypeAlias = tuple["Ledger", str, Mapping[str, Any]]
+Wanted: TypeAlias = tuple["Ledger", str, Section]
 """A point whose costs are wanted: the ledger that takes them, the controller, its nested settings."""
 LEDGER = ".jsonl"
 SHOWN = 60  # letters of wrong costs that a message holds
@@ -339,11 +340,11 @@ class Ledger:
         """Return the least mean cost, or None while there is none."""
         return min((sum(costs) / len(costs) for costs in self._costs.values()), default=None)
 
-    def costs(self, settings: Mapping[str, Any]) -> list[float] | None:
+    def costs(self, settings: Section) -> list[float] | None:
         """Return the costs of the runs under nested settings, or None if they are not known."""
         return self._costs.get(_key(settings))
 
-    def add(self, settings: Mapping[str, Any], costs: Sequence[float]) -> None:
+    def add(self, settings: Section, costs: Sequence[float]) -> None:
         """Write the costs of the runs under nested settings down."""
         record = {"settings": settings, "costs": list(costs)}
         text = f"{json.dumps(record)}\n"
@@ -366,7 +367,7 @@ def _costs(given: object) -> list[float]:
     return [float(each) for each in numbers]
 
 
-def _key(settings: Mapping[str, Any]) -> str:
+def _key(settings: Section) -> str:
     return json.dumps(settings, sort_keys=True)
 
 

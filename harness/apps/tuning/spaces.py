@@ -37,7 +37,13 @@ from optuna.samplers import TPESampler
 from servobench.controllers.aids import RANGES, SWITCHES, Switch, Tuned
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import choose_controller, find_controller, offered
-from servobench.harness.config.settings import apply_settings, flatten, nest, tuned_settings
+from servobench.harness.config.settings import (
+    Section,
+    apply_settings,
+    flatten,
+    nest,
+    tuned_settings,
+)
 from servobench.plant.contract.dependence import declared
 from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -258,7 +264,7 @@ class StudyRecord:
     best_trial: int  # the number of the best one; 0 is that of the defaults
     score: float  # that trial's
     second_score: float  # score on the second set; NaN until the settings are scored there
-    settings: Mapping[str, Any]  # nested values
+    settings: Section  # nested values
 
 
 def study(

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from servobench.controllers.algebra import nearest_rotation
 from servobench.plant.cameras.optics import COLUMNS, locate
 from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, NamedArrays
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.settings import remark
@@ -36,7 +36,7 @@ from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, col
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
 from servobench.plant.robot.parametric import ParametricModel
-from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
+from servobench.plant.robot.twin import CAMERA, LENS, Parameters, deviated, parameter_names
 
 LOG = "the log"  # in error messages
 VELOCITY = COMMAND.removesuffix("_command")  # as commands are misnamed
@@ -419,7 +419,7 @@ class _Problem:
         z: where the search begins, (p,).
     """
 
-    def __init__(self, log: Log, model: RobotModel, most: int, begin: Mapping[str, float]) -> None:
+    def __init__(self, log: Log, model: RobotModel, most: int, begin: Parameters) -> None:
         """Place the camera where the nominal robot, changed by the parameters `begin`, fits a log best."""
         self.log = log
         self.rows = frames_of(log, most)
@@ -485,7 +485,7 @@ class _Problem:
         geared = transmitted(motion(time), ripple, RIPPLE_ORDER)
         return time, geared + backlash * self.play(time)
 
-    def _seen(self, values: Mapping[str, float], time: FloatArray, image: FloatArray) -> FloatArray:
+    def _seen(self, values: Parameters, time: FloatArray, image: FloatArray) -> FloatArray:
         """Return h, (..., k, m), given what a camera that does not turn would see of a rigid tool."""
         if "turning" not in values:
             return image
@@ -544,7 +544,7 @@ class _Problem:
             return rate
         return turned(rate, at.values["turning"] * at.time)
 
-    def _by_robot(self, at: _Evaluation) -> tuple[FloatArray, dict[str, FloatArray]]:
+    def _by_robot(self, at: _Evaluation) -> tuple[FloatArray, NamedArrays]:
         """Return the derivatives of the image by the joints, (k, m, n), and by parameters of arm and camera, (k, m)."""
         values = at.values
         robot = ParametricModel(self.model.with_lens(_lens(values)))
@@ -659,7 +659,7 @@ def sees_pixels(model: RobotModel) -> bool:
     return isinstance(model, SetupModel) and model.setup.name == PIXEL.name
 
 
-def _lens(values: Mapping[str, float]) -> FloatArray:
+def _lens(values: Parameters) -> FloatArray:
     return np.array([values.get(name, 0.0) for name in LENS])
 
 
@@ -787,7 +787,7 @@ def identify(
     model: RobotModel,
     most: int = MAX_FRAMES,
     fits: int = FITS,
-    begin: Mapping[str, float] | None = None,
+    begin: Parameters | None = None,
 ) -> Identified:
     """Identify a robot from a log.
 

@@ -22,6 +22,7 @@ from servobench.harness.apps.figures.style import (
     TEXT,
     WIDE,
     Layout,
+    Look,
     add_legend,
     drawing_of,
     figure_style,
@@ -47,7 +48,7 @@ PANEL = 2.1  # [in] height of a panel
 MIN_IN_BIN = 5  # frames
 AXIS_ROOM = 4.5  # [1] half of the height of a panel over the deviation of residuals
 PLANES = (("x", "y"), ("x", "z"))  # in the base frame
-DRAWN: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0}
+DRAWN: Look = {"linestyle": "", "marker": ".", "markersize": 2.0}
 
 
 class Region(NamedTuple):

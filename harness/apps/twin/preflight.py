@@ -25,6 +25,7 @@ from servobench.harness.apps.twin.search import searched
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.twin import Parameters
 
 # Features in m that move farther than the nominal robot's by this factor are in another unit.
 MAX_MOTION_RATIO = 20.0  # [1]
@@ -99,7 +100,7 @@ def _far_robot(log: Log, model: RobotModel) -> Identified:
     as_it_is = _Remedy("", log, model)
     noise = _noise_for_misfits(log)
 
-    def misfit(begin: Mapping[str, float]) -> float:
+    def misfit(begin: Parameters) -> float:
         return _misfit(_fit(as_it_is, begin), noise)
 
     return identify(log, model, begin=min(searched(log, model), key=misfit))
@@ -278,7 +279,7 @@ def _halves(log: Log) -> Iterator[tuple[Log, int]]:
             yield log._replace(valid=in_half), way
 
 
-def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[str, float]) -> str:
+def _named_remedies(log: Log, model: RobotModel, others: Others, known: Parameters) -> str:
     """Name the one or two mistakes without which the log is explained far better, and others that do so as well.
 
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
@@ -312,7 +313,7 @@ def _named_remedies(log: Log, model: RobotModel, others: Others, known: Mapping[
     return f"{', or '.join(names)} (undone, {left:.0%} of the error is left{which})"
 
 
-def _fit(remedy: _Remedy, begin: Mapping[str, float] | None = None) -> Identified:
+def _fit(remedy: _Remedy, begin: Parameters | None = None) -> Identified:
     """Return the robot behind a remedy, by a few frames."""
     return identify(remedy.log, remedy.model, FRAMES, fits=2, begin=begin)
 
