@@ -6,11 +6,9 @@ show it, which stand in `metrics.toml`, and the function that computes it. docs/
 """
 
 import math
-import tomllib
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +19,7 @@ from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.harness.run.scenario import Span
 from servobench.plant.contract.checks import AnyArray, FloatArray, IntArray, NamedArrays
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.lanes import norm
 
 SETTLING_SHARE = 0.05  # band as a share of the initial error
@@ -356,7 +355,7 @@ def _declared(column: str, summary: Any = None, **entry: Any) -> Metric:  # noqa
     return Metric(column, values=_VALUES.get(column), summary=summary, **entry)
 
 
-_TABLE = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text(encoding="utf-8"))
+_TABLE = read_beside(__file__, "metrics.toml")
 BUILT_IN = {column: _declared(column, **entry) for column, entry in _TABLE.items()}
 """Every metric of this package by the name of its column, in the order of the table of runs."""
 METRICS: Mapping[str, Metric] = ChainMap(DECLARED, BUILT_IN)

@@ -1,21 +1,19 @@
 """The protocol of submissions: what `protocol.toml` says, and the robots that a pack draws."""
 
 import hashlib
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from servobench.harness.apps.studies.challenge import Challenge, find_challenge
 from servobench.harness.batch.plan import Cell
 from servobench.harness.config.settings import Settings
 from servobench.plant.contract.checksums import digest
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
-_FILE = files("servobench.harness.apps.board") / "protocol.toml"
-_PROTOCOL: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+_PROTOCOL = read_beside(__file__, "protocol.toml")
 VERSION: str = _PROTOCOL["version"]
 ROBOTS: int = _PROTOCOL["robots"]
 KINDS: Mapping[str, Sequence[str]] = _PROTOCOL["kinds"]

@@ -1,7 +1,6 @@
 """Pictures of analysed loops: Bode, Nyquist, sensitivity, step, limits of gain over latency; and a page of them."""
 
 import math
-import tomllib
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -23,6 +22,7 @@ from servobench.harness.apps.figures.style import (
 from servobench.harness.apps.loops.loop_analysis import LoopAnalysis
 from servobench.harness.apps.loops.systems import largest_gain, loci, sensitivity
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.files import write_atomically
 
 PAGE = "analyse.html"
@@ -33,7 +33,7 @@ FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # [1] factors on the command
 # [1] M_s at the edges of the colours; above 2 a loop is hardly robust.
 PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)
 COLUMNS = 3
-SHEET = tomllib.loads(Path(__file__).with_name("pictures.toml").read_text(encoding="utf-8"))
+SHEET = read_beside(__file__, "pictures.toml")
 LINES = SHEET["lines"]
 
 

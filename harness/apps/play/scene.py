@@ -3,8 +3,6 @@
 What the camera measures lies below its node, whose pose it has.
 """
 
-import tomllib
-from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, final
@@ -15,10 +13,11 @@ from viser.transforms import SO3
 
 from servobench.harness.apps.play.session import Session
 from servobench.plant.bench.bench import turned_about_axis
+from servobench.plant.contract.facts import read_beside
 from servobench.plant.rendered.room import Room
 from servobench.plant.robot.catalogue import find_robot
 
-PAGE = tomllib.loads(files(__package__).joinpath("page.toml").read_text(encoding="utf-8"))
+PAGE = read_beside(__file__, "page.toml")
 SPACING = 1.9  # [m] between the bases of two arms
 
 
