@@ -63,8 +63,7 @@ def try_to_build(word: str, name: str, robot_name: str) -> None:
     else:
         setup = PlantSetup(robot.nominal, robot.workspace.home, period, robot)
     with configuration_errors(f"plant {name}: "), contextlib.suppress(RunFault):
-        config = entry.config() if entry.config_for is None else entry.config_for(robot)
-        plant = entry.build(config, setup)
+        plant = entry.build(entry.settings_for(robot), setup)
         with contextlib.suppress(Exception):  # `servobench check plant` reports it
             plant.close()
 

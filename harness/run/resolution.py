@@ -186,7 +186,7 @@ def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # no
         raise ConfigurationError(
             f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply"
         )
-    config = entry.config() if entry.config_for is None else entry.config_for(robot)
+    config = entry.settings_for(robot)
     with configuration_errors():
         if camera is not None:
             config = replace(config, sensing=camera.sensing(config.sensing, period))

@@ -244,6 +244,12 @@ class PlantEntry:
     any_sensing: bool = False
     no_model: bool = False
 
+    def settings_for(self, robot: Robot) -> Any:  # noqa: ANN401 - of any plant
+        """Return the default settings for a robot."""
+        if self.config_for is None:
+            return self.config()
+        return self.config_for(robot)
+
 
 class World(Abilities):
     """A robot and its camera, which only advance and measure; `Bench` makes a plant of it.

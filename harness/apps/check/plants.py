@@ -220,10 +220,7 @@ class PlantChecks:
         model, _ = sample_mismatch(Mismatch.parse(MISMATCH), robot, 1)
         start = np.array([TURN, *np.zeros(robot.n - 1)]) + robot.workspace.home
         setup = PlantSetup(model, start, period, robot)
-        config = (
-            self.entry.config() if self.entry.config_for is None else self.entry.config_for(robot)
-        )
-        return self.entry.build(config, setup), setup
+        return self.entry.build(self.entry.settings_for(robot), setup), setup
 
     def _commands(self) -> list[Command]:
         spec = self._plant.spec
