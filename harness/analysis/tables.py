@@ -521,7 +521,7 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
             row[where, f"{achievement(place)} [%]"] = f"{share:.0f}"
             metric = judged_metric(place)
             values = judged_column(place)[is_own]
-            middle = median_with_interval(values) if len(values) else NO_ESTIMATE
+            middle = _median(values)
             if is_pooled:
                 middle = Estimate(middle.value, math.nan, math.nan, middle.count)
             row[where, metric_heading(metric, place)] = f"{middle:.{METRICS[metric].digits}f}"

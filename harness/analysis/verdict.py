@@ -230,22 +230,21 @@ def _with_few_seeds(runs: pd.DataFrame) -> list[str]:
 
 
 def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
-    order, against = _ranked(place, own)
+    first, against, small = _ranked(place, own)
     metric = judged_metric(place)
-    unit, factor = shown_unit(metric, place)
-    small = factor * margin(metric, place)
+    unit, _ = shown_unit(metric, place)
     # Verdicts are on the first: those against which it is better are behind it.
     having: dict[str, list[str]] = {}
     for name, difference in against.items():
         having.setdefault(difference.verdict, []).append(name)
-    best = [order[0], *having.get("equivalent", [])]
+    best = [first, *having.get("equivalent", [])]
     behind = next(iter(having.get("better", [])), "")
     by = math.nan
     if behind and against[behind].mean.high < -small:
         by = -against[behind].mean.value
     return _Standing(
         where=words,
-        first=order[0],
+        first=first,
         equal=tuple(name for name in dict.fromkeys(own["controller"]) if name in best),
         undecided=tuple(having.get("undecided", ())),
         ahead=tuple(having.get("worse", ())),
@@ -344,8 +343,8 @@ def _competitions(
     return []
 
 
-def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str, Difference]]:
-    """Return the controllers of a place, best first, and how the first one differs from each other one."""
+def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[str, dict[str, Difference], float]:
+    """Return the best controller of a place, how it differs from each other one, best first, and the margin."""
     table = judged_values(place)
     shares = _shares(own)
     metric = judged_metric(place)
@@ -356,7 +355,7 @@ def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str
     for name in others:
         pair = table[[first, name]].dropna()
         against[name] = paired_difference(pair.iloc[:, 0], pair.iloc[:, 1], small)
-    return [first, *others], against
+    return first, against, small
 
 
 def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
@@ -366,7 +365,8 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
     metric = judged_metric(place)
     unit, _ = shown_unit(metric, place)
     spec = f".{METRICS[metric].digits}f"
-    (first, second, *_), against = _ranked(place, own)
+    first, against, _ = _ranked(place, own)
+    second = next(iter(against))
     rivals = [name for name, each in against.items() if each.verdict != "better"]
     sure = _listed(rivals).replace("`", "") if rivals else "none"
 

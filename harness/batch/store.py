@@ -27,6 +27,7 @@ from servobench.harness.batch.results import (
 from servobench.harness.batch.schema import MANIFEST, encode
 from servobench.harness.batch.tables import writing
 from servobench.harness.run.result import RunResult, log_entry
+from servobench.plant.bench.plant import ImageArray
 from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, Write, accessing, write_atomically
@@ -83,17 +84,15 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     with writing(folder):
         for result in outcome:
             if result.picture is not None:
-                _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result)
+                _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result.picture)
         write_vouched(folder, files)
 
 
-def _write_picture(path: Path, result: RunResult) -> None:
-    if result.picture is None:
-        return
+def _write_picture(path: Path, picture: ImageArray) -> None:
     import cv2  # noqa: PLC0415 - only pictures of cameras need it
 
     path.parent.mkdir(exist_ok=True)
-    large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    large = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     content = cv2.imencode(".png", cv2.cvtColor(large, cv2.COLOR_RGB2BGR))[1].tobytes()
     write_atomically(path, lambda file: file.write_bytes(content))
 

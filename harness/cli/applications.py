@@ -16,6 +16,7 @@ import typer
 from servobench.harness.cli.options import command
 
 HARNESS = "servobench.harness"
+HELP_NAMES = ["-h", "--help"]
 
 
 class Application(NamedTuple):
@@ -77,7 +78,7 @@ def assemble(called: str, callback: Callable[..., None]) -> typer.Typer:
         called: first word of the call.
         callback: takes the options that stand before a command.
     """
-    names = {"help_option_names": ["-h", "--help"]}
+    names = {"help_option_names": HELP_NAMES}
     app = typer.Typer(context_settings=names, pretty_exceptions_enable=False)
     app.callback()(callback)
     known = {name for commands in PANELS.values() for name in commands}

@@ -14,7 +14,7 @@ import typer
 import typer.main
 from rich.markup import escape
 
-from servobench.harness.cli.applications import assemble
+from servobench.harness.cli.applications import HELP_NAMES, assemble
 from servobench.harness.cli.options import ABSENT
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED, ending_alike
 from servobench.plant.contract.faults import ConfigurationError
@@ -23,7 +23,6 @@ from servobench.plant.contract.files import harmless
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE,
         errno.ENAMETOOLONG)  # fmt: skip
 NO_THREAD = "can't start new thread"  # message of Python
-HELP_NAMES = ["-h", "--help"]
 # And the reverse
 PLURALS = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))
 COMPLETION_REQUEST = (
