@@ -59,7 +59,7 @@ def log_wealth(values: FloatArray, bound: float) -> FloatArray:
         share = part / (1.0 + bound)
         growth = np.cumsum(np.log1p(share * gains), axis=-1)
         wealths.append(growth + np.log(weight))
-    return np.asarray(np.logaddexp.reduce(wealths))
+    return np.logaddexp.reduce(wealths)
 
 
 def decide(

@@ -126,7 +126,7 @@ def _next_place(
         fit = are_apart(postures, last, box, setting) & are_fit(postures, box, setting)
         for posture in postures[fit]:
             if stays_in_reach(posture, box, setting):
-                return np.asarray(posture)
+                return posture
     raise ValueError(
         f"no further target between lower and upper is shortest = {box.shortest:g} m from the last one and above the "
         f"table by lowest = {box.lowest:g} m"

@@ -119,7 +119,7 @@ def _repeated_periods(
                 state = states[k // STRETCH]
             state, repeated[k], _ = recorded.step(state, row)
         sizes = np.maximum(1.0, np.abs(outputs))
-        return np.asarray((np.abs(repeated - outputs) / sizes).max(axis=1))
+        return (np.abs(repeated - outputs) / sizes).max(axis=1)
 
     whole = differences(len(inputs))
     if whole.max() <= TOLERANCE:

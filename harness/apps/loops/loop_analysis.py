@@ -154,7 +154,7 @@ def multisine(length: int) -> FloatArray:
     spectrum[-1] = 1.0  # real at the Nyquist frequency
     signal = np.fft.irfft(spectrum, length)
     root_mean_square = np.sqrt(np.mean(signal**2))
-    return np.asarray(AMPLITUDE * signal / root_mean_square)
+    return AMPLITUDE * signal / root_mean_square
 
 
 def excite(loop: SmallMotions, inputs: int, length: int = LENGTH) -> list[Record]:

@@ -146,4 +146,4 @@ def one_line(heading: str) -> str:
 def _falling_phase(curve: FloatArray) -> FloatArray:
     """Return the phase of a locus without jumps, [°], that begins between −270 and 90."""
     phase = np.rad2deg(np.unwrap(np.angle(curve)))
-    return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
+    return phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0)

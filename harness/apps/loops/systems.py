@@ -220,12 +220,12 @@ class LoopResponse:
         from_feature, from_joints = self._paths()
         inner = np.eye(from_joints.shape[-1]) - from_joints  # the loop over joint positions
         command = np.linalg.solve(inner, from_feature)
-        return np.asarray(-(self.arm.jacobian @ command))
+        return -(self.arm.jacobian @ command)
 
     def _paths(self) -> tuple[ComplexArray, ComplexArray]:
         """Return the controller's response times a joint's, from feature (k, n, m) and joint positions (k, n, n)."""
         m = len(self.arm.jacobian)
-        z = np.asarray(np.exp(1j * self.frequency * self.arm.period))
+        z = np.exp(1j * self.frequency * self.arm.period)
         exposed, joints = self.arm.response(z)
         from_feature = exposed[:, None, None] * self.controller[:, :, :m]
         from_joints = joints[:, None, None] * self.controller[:, :, m:]

@@ -137,7 +137,7 @@ class Log(NamedTuple):
     @property
     def stamped(self) -> BoolArray:
         """Which rows have a new frame with a stamp, (k,)."""
-        return np.asarray(self.valid & np.isfinite(self.captured))
+        return self.valid & np.isfinite(self.captured)
 
     @property
     def lateness(self) -> FloatArray:
@@ -234,7 +234,7 @@ def _repeated(features: FloatArray) -> BoolArray:
     _, kinds, counts = np.unique(features, axis=0, return_inverse=True, return_counts=True)
     is_frequent = counts > max(2, MAX_REPEATED * len(features))
     placeholder = is_frequent[kinds[1:]] & left_and_back[runs]
-    return np.asarray((~changed | placeholder) & beside_large[runs])
+    return (~changed | placeholder) & beside_large[runs]
 
 
 def read_log(
@@ -326,7 +326,7 @@ class Identified:
     @property
     def deviations(self) -> FloatArray:
         """Standard deviations of the parameters, (p,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; 0 and infinite for one that the log does not have."""
@@ -351,7 +351,7 @@ class Identified:
     def rates(self, log: Log) -> FloatArray:
         """Return how fast the features of these frames move, (k, m), 1/s."""
         predicted = log.features[self.rows] - self.residuals
-        return np.asarray(np.gradient(predicted, log.frame_time[self.rows], axis=0))
+        return np.gradient(predicted, log.frame_time[self.rows], axis=0)
 
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
@@ -364,8 +364,8 @@ class Identified:
         rows = frames_of(log)
         latency = self.values[self.names.index("latency")]
         joints = CubicSpline(log.time, log.joints)(log.frame_time[rows] - latency)
-        features = np.asarray(self.model(nominal).feature(joints))
-        return np.asarray(log.features[rows] - features)
+        features = self.model(nominal).feature(joints)
+        return log.features[rows] - features
 
 
 def kind_of(name: str) -> str:
@@ -431,7 +431,7 @@ class _Problem:
         pixels = sees_pixels(model)
         self.names = _parameters(model, pixels=pixels)
         self.scale = np.array([prior(name) for name in self.names])
-        self.nominal = np.asarray(model.camera)
+        self.nominal = model.camera
         self.of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model = model
         self.pace = 1.0
@@ -502,7 +502,7 @@ class _Problem:
         image = _image(model, ball)
         self._last_key = self._key(z)
         self._last = _Evaluation(values, time, q, model, ball, image)
-        return np.asarray(self.y - self._seen(values, time, image))
+        return self.y - self._seen(values, time, image)
 
     def _key(self, z: FloatArray) -> tuple[bytes, float, RobotModel]:
         return z.tobytes(), self.pace, self.model
@@ -572,7 +572,7 @@ class _Problem:
 
     def pose(self, z: FloatArray) -> FloatArray:
         """Return the pose of the camera, (4, 4)."""
-        return np.asarray(deviated(self.model, self.values(z)).camera)
+        return deviated(self.model, self.values(z)).camera
 
     def recentred(self, z: FloatArray) -> FloatArray:
         """Take the pose of the camera for that from which it deviates, and return the z that is left.
@@ -587,7 +587,7 @@ class _Problem:
         rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
         path = rigid.feature(self.log.joints)
         self.pull = CubicSpline(self.log.time, self._by_cubics(path, 2))
-        return np.asarray(z * ~self.of_camera)
+        return z * ~self.of_camera
 
     def _by_cubics(self, path: FloatArray, derivative: int) -> FloatArray:
         """Return a derivative of a path at the rows, (k, m), by cubics through what is near each row.
@@ -598,7 +598,7 @@ class _Problem:
         """
         period = self.log.spec.period
         rows = max(2 * round(0.5 * SMOOTHED_SPAN / period) + 1, MIN_CUBIC_ROWS)
-        return np.asarray(savgol_filter(path, rows, 3, deriv=derivative, delta=period, axis=0))
+        return savgol_filter(path, rows, 3, deriv=derivative, delta=period, axis=0)
 
     def swung(self, z: FloatArray) -> FloatArray:
         """Take the period with which the latency swings most likely, and return the z with the sizes there.

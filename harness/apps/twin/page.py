@@ -120,7 +120,7 @@ def region_of(answer: Answer, joints: FloatArray) -> Region:
         moved = deviated(model, changed).feature(joints) - feature
         variance += np.sum((moved / STEP) ** 2, axis=-1)
     ball = deviated(model, static).arm.ball_position(joints)
-    return Region(np.asarray(ball), np.sqrt(variance))
+    return Region(ball, np.sqrt(variance))
 
 
 def _pictures(answer: Answer, region: Region) -> list[Picture]:

@@ -71,7 +71,7 @@ def missing_frames(log: Log) -> FloatArray:
     gaps = np.diff(np.flatnonzero(log.valid))
     length = frame_period(log) / log.spec.period  # [rows]
     longest = math.ceil(length - 1e-9)
-    return np.asarray(np.where(gaps > longest, np.rint(gaps / length) - 1.0, 0.0))
+    return np.where(gaps > longest, np.rint(gaps / length) - 1.0, 0.0)
 
 
 def lost_share(log: Log) -> float:
