@@ -1,6 +1,6 @@
 """A controller of your own with the aids of the others: it is the law of a composed controller.
 
-    Observation → pair → estimate → predict → own controller → feedforward, posture, limit → Command
+    Observation → pair → estimate → predict → own controller → feedforward, posture, limit, calming → Command
 
 The regression on the nominal Jacobian stands in the estimator's place. The controller gets, in the unit of the plant:
 

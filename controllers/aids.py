@@ -91,6 +91,8 @@ class AidsConfig:
         Switch("redistribute", tuned=("scale", "clip", "redistribute")),
     ] = "scale"
     """Saturation of a command: scaled, clipped by joint, or redistributed."""
+    calming: Annotated[bool, Switch(equipped=True)] = False
+    """Slow down where the command turns back at its limit in each period, as at targets out of reach."""
     longest_delay: Annotated[NonNegative, Le(1.0), Only(delay="identified")] = 0.25
     """[s] longest delay considered, if identified."""
     latency: Annotated[Delay, Only(delay="given")] = 0.0

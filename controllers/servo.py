@@ -1,6 +1,6 @@
 """A controller composed of a Jacobian estimator, a control law and the stages around them.
 
-    Observation → pair → estimate → predict → law → feedforward, posture, limit → Command
+    Observation → pair → estimate → predict → law → feedforward, posture, limit, calming → Command
 
 Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.methods`; the
 stages are the aids (`servobench.controllers.aids`). `Servo` is the pure composition, for one run or many side by side;
@@ -49,6 +49,7 @@ class ServoState(NamedTuple):
     ready: BoolArray  # (...), whether the initial Jacobian is known
     limited: BoolArray  # (...), whether the last command was limited
     calibration: Any  # state of the calibrating stage; None without one
+    pace: Any  # state of calming; None without it
 
     @property
     def jacobian(self) -> FloatArray:
@@ -190,6 +191,7 @@ class Servo:
             ready=ready,
             limited=np.zeros_like(ready)[()],
             calibration=None if self.calibration is None else self.calibration.start(observation),
+            pace=self.finish.start(observation),
         )
 
     def _act(self, stepped: Stepped, observation: Observation, reference: FloatArray) -> Stepped:
@@ -241,11 +243,14 @@ class Servo:
             forward = later[..., 1, :] - later[..., 0, :] - drift
         u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
         u = self.law.restrained(law, wanted, u)
+        pace = state.pace
+        if pace is not None:
+            pace, u, limited = self.finish.calm(pace, u, limited)
         law = self.law.noted(law, u, limited)
         if self.predictor is not None:
             predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)
         new = ServoState(
-            estimation, law, state.initial, predictor, state.ready, limited, calibration
+            estimation, law, state.initial, predictor, state.ready, limited, calibration, pace
         )
         return Stepped(new, u)
 

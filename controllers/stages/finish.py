@@ -7,6 +7,9 @@ scaled as a whole or redistributed among the joints: an arm with more joints tha
 at its limit, as the others take over. `redistribute` first shrinks the wanted step until no joint exceeds its limit.
 The joints that have room then make the rest of the feature's step, until one after the other has none left, always
 along the wanted direction of the feature.
+
+Where the target is out of reach, the stretched arm steps over the nearest point again and again, at full speed and in
+turn to both sides. Calming halves the speed that is allowed with each such turn, from the seventh in a row on.
 """
 
 import math
@@ -21,8 +24,12 @@ from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, repeat
-from servobench.plant.contract.signals import BoolArray
+from servobench.plant.contract.signals import BoolArray, Observation
 
+PATIENCE = np.array(64.0)  # [1] bound at rest; halved six times in a row, it begins to count
+SLOWEST = 1.0 / 64.0  # [1] least bound, by which the arm can still leave
+SLOWER = 0.5  # [1] factor on the bound after a turn
+FASTER = 1.25  # [1] the same after any other period
 MIN_ROOM = 1e-9  # [1] of its limit; a joint with less room is left out
 REMAINDER_TOLERANCE = 1e-6  # [1] of the step that may be left undone
 
@@ -136,9 +143,16 @@ def step_with_posture(
     return np.matvec(inverse, feature_step - share * np.matvec(jacobian, away)) + share * away
 
 
+class Pace(NamedTuple):
+    """How fast the arm may go, by calming."""
+
+    bound: FloatArray  # (...), share of the joints' speed limits, if below 1
+    command: FloatArray  # the last one, (..., n), rad/s
+
+
 @final
 class Finish:
-    """Applies those of the stages above whose aids are on; they have no state."""
+    """Applies those of the stages above whose aids are on; calming alone has a state."""
 
     def __init__(
         self, aids: AidsConfig, knowledge: RobotKnowledge, law: str, owns: Collection[str]
@@ -206,3 +220,32 @@ class Finish:
             )
             return step / self._period, excess > 1.0
         return wanted / np.maximum(excess, 1.0)[..., None], excess > 1.0
+
+    def start(self, observation: Observation) -> Pace | None:
+        """Return the state of calming at the start of a run; None without that aid."""
+        if not self._aids.calming:
+            return None
+        bound = np.broadcast_to(PATIENCE, observation.feature.shape[:-1])
+        return Pace(bound, np.zeros_like(observation.joint_position))
+
+    def calm(
+        self, pace: Pace, joint_velocity: FloatArray, limited: BoolArray
+    ) -> tuple[Pace, FloatArray, BoolArray]:
+        """Slow a command down that turned back at its limit in each of the last periods.
+
+        Args:
+            pace: the state.
+            joint_velocity: within its limits, (..., n), rad/s.
+            limited: whether it was larger, (...).
+
+        Returns:
+            The new state, the joint velocity, and whether it is limited now.
+        """
+        size = largest_excess(joint_velocity, self._limit)
+        limited = limited | (size > pace.bound)
+        turned = limited & (np.vecdot(joint_velocity, pace.command) < 0.0)
+        bound = np.where(turned, SLOWER * pace.bound, FASTER * pace.bound)
+        bound = np.minimum(np.maximum(bound, SLOWEST), PATIENCE)
+        slowed = joint_velocity * (bound / np.maximum(size, bound))[..., None]
+        joint_velocity = np.where((bound < 1.0)[..., None], slowed, joint_velocity)
+        return Pace(bound, joint_velocity), joint_velocity, limited

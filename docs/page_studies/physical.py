@@ -120,6 +120,9 @@ def ends_table(folder: Path) -> dict[str, pd.DataFrame]:
     unreachable = {
         "target out of reach": cells.counted,
         "error at the end, mm": lambda runs: cells.millimetres(runs, "steady_state_error", 0),
+        "sign switches": lambda runs: cells.short(
+            median_with_interval(column_of(runs, "command_switches")), 0
+        ),
     }
     singular_start = {
         "arm stretched at the start": cells.counted,

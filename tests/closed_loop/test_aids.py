@@ -11,6 +11,13 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 
 EQUIPPED = ("regression_mfac", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
+CALMED = (
+    "regression_mfac",
+    "calibrating_mfac",
+    "ukf_mfac",
+    "ukf_mpc",
+    "rbf_pid",
+)  # `rbfnn_mfac` drifts on
 TURNED = "moderate+camera_rotation=120deg"
 PLUS, PAPER = "regression_mfac", "rbfnn_mfac:published"
 IDENTIFYING = [
@@ -90,6 +97,18 @@ def test_the_posture_moves_the_arm_at_rest_without_spoiling_the_jacobian(name, s
     request = RunRequest("kinematic", name, "random", "moderate", seed, sensing=sensing)
     error = run_experiment(request, read_settings(None, [])).steps["jacobian_error"].to_numpy()
     assert error[-1] < 1.2 * error[20] < 0.3
+
+
+@pytest.mark.parametrize("name", some(CALMED, PLUS, "ukf_mpc"))
+def test_before_a_target_out_of_reach_the_arm_comes_to_rest(name):
+    """Without calming, the stretched arm is driven to and fro at full speed."""
+    calm, wild = (
+        rows(name, "unreachable", "moderate", [46003, 46004], f"{name}.aids.calming={on}")
+        for on in ("true", "false")
+    )
+    for one, other in zip(calm, wild, strict=True):
+        assert one["command_switches"] < 0.25 * other["command_switches"]
+        assert one["steady_state_error"] < 1.02 * other["steady_state_error"]
 
 
 @pytest.mark.parametrize(

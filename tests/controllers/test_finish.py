@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kit.toy import KNOWLEDGE, LIMIT, PERIOD, A, N
+from kit.toy import KNOWLEDGE, LIMIT, PERIOD, A, M, N, seen
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.stages.finish import Finish, redistribute, scale_to_limit
+from servobench.plant.contract.lanes import stack
 
 NOTHING = np.zeros(())
 
@@ -93,6 +94,39 @@ def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
     held, _ = finish(wanted, at_edge, J=J, limit="redistribute", damping=1e-6)
     np.testing.assert_allclose(free[:2], [1.0, 0.5], atol=1e-4)
     np.testing.assert_allclose(held[:2], [1.0, 0.0], atol=1e-4)
+
+
+def test_a_command_that_turns_back_at_its_limit_again_and_again_is_slowed_down():
+    """The seventh turn in a row halves the speed; each period without one gives a quarter of it back."""
+    stage = Finish(AidsConfig(calming=True), KNOWLEDGE, "ALaw", ())
+    full = np.linspace(-1.0, 0.5, N) * LIMIT
+    pace = stage.start(seen(np.zeros(N), np.zeros(M)))
+    shares = []
+    for sign in (1, -1, 1, -1, 1, -1, 1, -1, 1, 1, 1, 1, 1):
+        pace, u, limited = stage.calm(pace, sign * full, np.True_)
+        shares.append(np.max(u / (sign * full)))
+        np.testing.assert_allclose(u, sign * shares[-1] * full, rtol=1e-15)
+        assert limited
+    np.testing.assert_allclose(shares[:7], 1.0, rtol=0)
+    np.testing.assert_allclose(shares[7:], [0.5, 0.25, 0.3125, 0.390625, 0.48828125, 0.6103515625])
+
+
+def test_calming_leaves_small_commands_and_the_runs_beside_alone():
+    stage = Finish(AidsConfig(calming=True), KNOWLEDGE, "ALaw", ())
+    rest = seen(np.zeros(N), np.zeros(M))
+    pace = stack([stage.start(rest)] * 3)
+    size = np.array([[1.0], [0.9], [1.0]]) * np.ones((3, N)) * LIMIT
+    signs = np.array([[-1.0], [-1.0], [1.0]])  # a turn each period, one within the limits, no turn
+    for period in range(20):
+        wanted = size * signs**period
+        pace, u, limited = stage.calm(pace, wanted, np.array([True, False, True]))
+        np.testing.assert_array_equal(u[1:], wanted[1:])
+        assert limited.tolist() == [True, False, True]
+    np.testing.assert_allclose(u[0], wanted[0] / 64.0)
+    small = np.full((3, N), 0.01 * LIMIT)
+    _, u, limited = stage.calm(pace, small, np.zeros(3, dtype=bool))
+    np.testing.assert_array_equal(u, small)
+    assert not limited.any()
 
 
 @pytest.mark.parametrize(
