@@ -868,7 +868,7 @@ def _posterior(problem: _Problem, z: FloatArray, jacobian: FloatArray) -> Identi
     """
     errors = problem.errors(z)
     noise, inliers = robust_covariance(errors)
-    white = errors @ np.linalg.inv(np.linalg.cholesky(noise)).T
+    white = whitened(errors, noise)
     correlation = correlation_time(white * inliers[:, None])
     information = jacobian.T @ jacobian / correlation
     unit = np.eye(len(z))
@@ -894,6 +894,11 @@ def _posterior(problem: _Problem, z: FloatArray, jacobian: FloatArray) -> Identi
         correlation=correlation,
         swing_period=2.0 * np.pi / problem.pace,
     )
+
+
+def whitened(errors: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return errors (k, m) in a base and units in which their covariance (m, m) is I."""
+    return errors @ np.linalg.inv(np.linalg.cholesky(noise)).T
 
 
 def robust_covariance(errors: FloatArray) -> tuple[FloatArray, BoolArray]:

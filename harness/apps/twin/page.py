@@ -30,7 +30,7 @@ from servobench.harness.apps.figures.style import (
     panel_grid,
 )
 from servobench.harness.apps.report.page import Picture, page_asset, page_policy, page_template
-from servobench.harness.apps.twin.identification import Log
+from servobench.harness.apps.twin.identification import Log, whitened
 from servobench.harness.apps.twin.summary import Answer, estimates, handy, held_out_line, remarks
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_text
@@ -167,8 +167,7 @@ def _over_posture(answer: Answer, layout: Layout) -> Figure:
     """Draw the whitened residuals over the position of each joint."""
     log = answer.log
     robot = answer.robot
-    whitening = np.linalg.inv(np.linalg.cholesky(robot.noise)).T
-    white = robot.residuals @ whitening
+    white = whitened(robot.residuals, robot.noise)
     figure, panels = panel_grid(log.spec.n, PANEL, layout)
     joints = np.degrees(log.joints[robot.rows])
     for axes, name, own in zip(panels, log.spec.joint_names, joints.T, strict=True):

@@ -15,6 +15,7 @@ from servobench.harness.apps.twin.identification import (
     Log,
     kind_of,
     prior,
+    whitened,
 )
 from servobench.harness.apps.twin.sensor import lost_share, sensor
 from servobench.plant.contract.checks import FloatArray
@@ -194,8 +195,7 @@ def unexplained(log: Log, robot: Identified) -> tuple[float, float]:
         Their correlation from frame to frame in deviations of that of white noise, and the share of their variance
         that a quadratic function of the joint positions explains beyond chance.
     """
-    whitening = np.linalg.inv(np.linalg.cholesky(robot.noise)).T
-    white = (robot.residuals @ whitening)[robot.inliers]
+    white = whitened(robot.residuals, robot.noise)[robot.inliers]
     square = float(np.sum(white**2))
     along = float(np.sum(white[1:] * white[:-1])) / square * white.size**0.5
     q = log.joints[robot.rows][robot.inliers]
