@@ -117,9 +117,7 @@ def init(
 
     split = selection.split
     names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
-    requests = [
-        RunRequest(*each, Mismatch.parse("none"), 0, robot=robot) for each in product(*names)
-    ]
+    requests = [RunRequest(*each, Mismatch(), 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
     check_settings(settings, chain.from_iterable(names))
     finds: dict[str, Callable[[str], Any]] = {
