@@ -3,7 +3,7 @@
 It has the style and the tables of the report on a results folder, and loads nothing.
 """
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -125,10 +125,10 @@ def region_of(answer: Answer, joints: FloatArray) -> Region:
 
 def _pictures(answer: Answer, region: Region) -> list[Picture]:
     """Return the figures of the page, each for a wide and for a narrow one."""
-    drawings: dict[str, tuple[str, Callable[[Layout], Figure]]] = {
-        "time": ("Residuals over time", lambda layout: _over_time(answer, layout)),
-        "posture": ("Residuals over each joint", lambda layout: _over_posture(answer, layout)),
-        "region": ("Where the twin is sure", lambda layout: _over_region(answer, region, layout)),
+    drawings = {
+        "time": ("Residuals over time", partial(_over_time, answer)),
+        "posture": ("Residuals over each joint", partial(_over_posture, answer)),
+        "region": ("Where the twin is sure", partial(_over_region, answer, region)),
     }
     pictures = []
     with figure_style(TEXT):
