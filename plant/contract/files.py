@@ -7,10 +7,13 @@ import os
 import re
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
@@ -42,6 +45,12 @@ PARTIAL = re.compile(r"\..+-\d+-\d+")
 
 
 Write: TypeAlias = Callable[[Path], object]  # makes a file or a folder at a path
+Read = TypeVar("Read")
+Times: TypeAlias = dict[Path, int]  # when files were changed [ns]; 0 for one that is not there
+
+_TIMES: ContextVar[Times] = ContextVar(
+    "times of the files that were read by whoever keeps what they hold"
+)
 
 
 def write_atomically(path: Path, write: Write) -> None:
@@ -116,6 +125,8 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
 
     It names another file that was read meanwhile and cannot be. Without a path, any file may be the one.
     """
+    if path is not None and done == "read":
+        _TIMES.get({}).update(_times([path]))
     try:
         yield
     except OSError as error:
@@ -131,6 +142,38 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
             raise  # It is an error of a library that draws, or of no file in particular.
         named = f"{kind} {path}" if kind else error.filename or path
         raise ConfigurationError(f"{named} cannot be {done}: {reason(error)}") from error
+
+
+def kept_while_unchanged(read: Callable[..., Read]) -> Callable[..., Read]:
+    """Keep what a function makes of files, by its arguments, until one of the files that it read is another one."""
+    kept: dict[tuple[Any, ...], tuple[Read, Times]] = {}
+
+    @wraps(read)
+    def find(*arguments: Any) -> Read:  # noqa: ANN401 - those of the function
+        if arguments not in kept or _times(kept[arguments][1]) != kept[arguments][1]:
+            times: Times = {}
+            token = _TIMES.set(times)
+            try:
+                kept[arguments] = read(*arguments), times
+            finally:
+                _TIMES.reset(token)
+        found, times = kept[arguments]
+        _TIMES.get({}).update(times)  # for one that keeps what it makes of this
+        return found
+
+    return find
+
+
+def _times(paths: Iterable[Path]) -> Times:
+    """Return when files were changed."""
+    return {path: _time(path) for path in paths}
+
+
+def _time(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:  # whoever reads it says why
+        return 0
 
 
 def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not be imported here
@@ -167,6 +210,25 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
     text = read_text(kind, path)
     with configuration_errors(f"{kind} {path} is not valid TOML: ", RecursionError):
         return parse_toml(text)
+
+
+def yaml_loader() -> Any:  # noqa: ANN401 - a class of PyYAML's, which is not imported here
+    """Return a class that loads YAML and, other than PyYAML's own, refuses a key that a mapping has twice."""
+    import yaml  # noqa: PLC0415 - few commands read such a file
+
+    class Loader(yaml.SafeLoader):
+        """Raises a `ValueError` for such a key."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
+            keys = Counter(str(key.value) for key, _ in node.value)
+            for key, count in keys.items():
+                if count > 1:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"{key} is there twice", node.start_mark
+                    )
+            return super().construct_mapping(node, deep)
+
+    return Loader
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -17,7 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import accessing, divisions, is_file, read_toml, user_path
+from servobench.plant.contract.files import (
+    divisions,
+    is_file,
+    kept_while_unchanged,
+    read_toml,
+    user_path,
+)
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import SerialArm, arm_from_dh, narrow_limits
@@ -53,9 +59,7 @@ def find_robot(text: str) -> Robot:
     """
     word = read_word(text)
     if word.camera:
-        robot = find_robot(text.removesuffix(WITH + word.camera))
-        changed = _changed("camera", user_path(word.camera))
-        return _equipped(robot, word.camera, changed)
+        return _equipped(find_robot(text.removesuffix(WITH + word.camera)), word.camera)
     if text in ROBOTS:
         return ROBOTS[text]()
     kind, _, number = text.partition(":")
@@ -66,7 +70,6 @@ def find_robot(text: str) -> Robot:
                 f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7"
             )
         return random_robot(int(number))
-    path = user_path(word.robot)
     before_link = text.partition("#")[0]
     if PurePath(before_link).suffix.lower() == ".xacro":
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
@@ -76,13 +79,7 @@ def find_robot(text: str) -> Robot:
             f"unknown robot {text!r}: {known}; or a file: a factory calibration (.yaml), a DH table (.toml) or a "
             f".urdf; or an arm that is drawn, {RANDOM_ARM}:7"
         )
-    return _read(text, _changed("robot", path))
-
-
-def _changed(kind: str, path: Path) -> int:
-    """Return when a file was changed [ns]."""
-    with accessing(path, f"{kind} file", "read"):
-        return path.stat().st_mtime_ns
+    return _read(text)
 
 
 class RobotWord(NamedTuple):
@@ -169,16 +166,15 @@ def short_name(robot: str) -> str:
     return with_files(robot, lambda file: PurePath(file).name)
 
 
-@cache
-def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
-    """Return a robot with the camera of a file, which was `changed` at a time [ns]."""
-    del changed
+@kept_while_unchanged
+def _equipped(robot: Robot, camera: str) -> Robot:
+    """Return a robot with the camera of a file."""
     return robot.equipped(read_camera(user_path(camera)))
 
 
-@cache
-def _read(text: str, changed: int) -> Robot:
-    """Return the robot of a file, which was `changed` at a time [ns]."""
+@kept_while_unchanged
+def _read(text: str) -> Robot:
+    """Return the robot of a file."""
     from servobench.plant.robot import files, urdf_file  # noqa: PLC0415 - only files need their readers
 
     name, tip, _ = read_word(text)

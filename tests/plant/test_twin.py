@@ -1,5 +1,8 @@
 """Twins: robots that are drawn from the posterior of a file."""
 
+import itertools
+import os
+
 import numpy as np
 import pytest
 
@@ -195,6 +198,32 @@ def test_a_twin_finds_its_robot_beside_itself(tmp_path, monkeypatch, name):
         with_files("my arm.urdf#tool0 with camera.toml", str.upper)
         == "MY ARM.URDF#tool0 with CAMERA.TOML"
     )
+
+
+def test_a_robot_is_read_again_once_a_file_that_it_names_has_changed(tmp_path):
+    """A camera names its intrinsics and a twin its robot; an unchanged robot is the same object."""
+    times = itertools.count(1)
+
+    def change(text, name):
+        path = write(tmp_path, text, name)
+        os.utime(path, ns=(0, next(times)))
+        return path
+
+    change(FOUR_JOINTS, "arm.toml")
+    twin = change(TWIN.replace("ur10e", "arm.toml").replace("elbow", "joint_3"), "twin.toml")
+    intrinsics = "width: 640\nheight: 480\nk: [615, 0, 320, 0, 615, 240, 0, 0, 1]\n"
+    change(intrinsics, "intrinsics.yaml")
+    camera = change('intrinsics = "intrinsics.yaml"\n', "camera.toml")
+    word = f"{twin} with {camera}"
+    robot = find_robot(word)
+    assert find_robot(word) is robot
+    change(intrinsics.replace("615", "600"), "intrinsics.yaml")
+    seen = find_robot(word)
+    assert (robot.camera.matrix[0, 0], seen.camera.matrix[0, 0]) == (615.0, 600.0)
+    change(FOUR_JOINTS.replace("joint_speed = [2.0", "joint_speed = [0.5"), "arm.toml")
+    slower = find_robot(word)
+    assert slower.limits.speed[0] == 0.5 < seen.limits.speed[0]
+    assert find_robot(word) is slower
 
 
 @pytest.mark.parametrize("mismatch", ["moderate", "tool=20mm"])
