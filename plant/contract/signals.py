@@ -28,6 +28,7 @@ BoolArray = npt.NDArray[np.bool_]
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 JOINT_UNIT = "rad"
 COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
+MAX_NAME = 100  # [letters] in the name of a joint or feature
 SETTLING_BAND = 0.005  # share of a feature's natural size: 5 mm on the UR5
 
 
@@ -64,6 +65,11 @@ class Channel:
                 )
             bound.flags.writeable = False
             object.__setattr__(self, name, bound)
+        for name in self.names:
+            if not str(name).isprintable() or len(name) > MAX_NAME:
+                raise ValueError(
+                    f"a joint or feature cannot have the name {name!r}, which is long or cannot be printed"
+                )
         if len(set(self.names)) < len(self.names):
             raise ValueError(
                 f"each joint and feature needs a name of its own, got {', '.join(self.names)}"

@@ -68,6 +68,7 @@ ARM_FEATURES = ("ball_position", "feature")
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL = "structuralParameter"
 EXACT = 2**53  # largest number up to which float64 holds all whole numbers
+ROUNDED_START = 1e-6  # [rad] by which a joint may start out of its limits
 
 Setter = Callable[[Instance, int], None]
 
@@ -154,6 +155,8 @@ class FmuWorld(World):
             make = partial(open_instance, description, mapping.tolerance, mapping.debug_log)
             self._instances.open(prod(self.lead), make, self._lane)
             self._initialise()
+            if self._is_foreign:
+                self._check_start()
             for fault in self.faults.values():
                 raise fault  # noqa: TRY301 - the instances are closed below
         except BaseException:
@@ -183,6 +186,19 @@ class FmuWorld(World):
         self._true = build_model(mapping, self.description) if truth.states else None
         nominal = mapping.nominal
         self._nominal = None if nominal is None else build_model(mapping, self.description, nominal)
+
+    def _check_start(self) -> None:
+        """Refuse limits that are not kept at the start."""
+        lower = self.spec.joint_lower
+        upper = self.spec.joint_upper
+        off = np.maximum(lower - self._joints, self._joints - upper)
+        if off.max() > ROUNDED_START:
+            i = off.argmax() % self.spec.n
+            name = self.spec.joint_names[i]
+            raise ValueError(
+                f"{self.description.path.name} starts with {name} out of the limits of its mapping, {lower[i]:g} to "
+                f"{upper[i]:g} rad, by {off.max():g} rad"
+            )
 
     def _lane(self, instance: Instance, row: int) -> Lane:
         return Lane(

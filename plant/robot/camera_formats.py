@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from servobench.plant.contract.facts import read_facts
-from servobench.plant.contract.files import read_text
+from servobench.plant.contract.files import read_text, yaml_loader
 from servobench.plant.contract.settings import remark
 
 FACTS = read_facts("cameras")
@@ -87,15 +87,15 @@ def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
     """Return the first document of a YAML file."""
     import yaml  # noqa: PLC0415 - few runs have such a file
 
-    class Loader(yaml.SafeLoader):
-        """Reads OpenCV's matrices as mappings, and numbers such as 1e-05 and -.2, which are texts in YAML 1.1."""
+    # OpenCV's matrices are mappings, and numbers such as 1e-05 and -.2 are texts in YAML 1.1.
+    loader_class = yaml_loader()
 
     def mapping(loader: Any, node: Any) -> Any:  # noqa: ANN401 - PyYAML's
         return loader.construct_mapping(node, deep=True)
 
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", NUMBER, list("-+.0123456789"))
+    loader_class.add_implicit_resolver("tag:yaml.org,2002:float", NUMBER, list("-+.0123456789"))
     for tag in ("opencv-matrix", "opencv-nd-matrix"):
-        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", mapping)
+        loader_class.add_constructor(f"tag:yaml.org,2002:{tag}", mapping)
     text = read_text("file", path)
     if text.lstrip().startswith("<"):
         raise ValueError(
@@ -105,7 +105,7 @@ def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
         # OpenCV writes a directive that PyYAML does not read.
         text = text.partition("\n")[2]
     try:
-        documents = yaml.load_all(text, Loader)
+        documents = yaml.load_all(text, loader_class)
         # `ros2 topic echo` puts --- after each message.
         return next(documents, None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.files import read_text, user_path
+from servobench.plant.contract.files import read_text, user_path, yaml_loader
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, Links, SerialArm, arm_from_dh, plain_arm
 from servobench.plant.robot.robot import Robot, at_far_end, cylinder_inertia
@@ -178,7 +178,7 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     wanted = f"the blocks {', '.join(CALIBRATION_BLOCKS)}, each with {', '.join(keys)}"
     text = read_text("calibration file", path)
     try:
-        blocks = yaml.safe_load(text)["kinematics"]
+        blocks = yaml.load(text, yaml_loader())["kinematics"]
         numbers = [[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS]
         table = np.array(numbers)
     except yaml.YAMLError as error:

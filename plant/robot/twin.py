@@ -223,6 +223,11 @@ def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
             raise ValueError(
                 f"{what}: {keys.robot} has no parameter {name!r} there{did_you_mean(name, known)}"
             )
+    if len(set(keys.parameters)) < len(keys.parameters):
+        raise ValueError(f"{what}: parameters has a name twice")
+    for name in TIMES:
+        if keys.mean.get(name, 0.0) < 0.0:
+            raise ValueError(f"{what}: mean.{name} must be at least 0 s, got {keys.mean[name]:g}")
     if keys.camera.pose.frame != "base":
         raise ValueError(f'{what}: camera.pose must have frame = "base", position and rotation')
     if any(len(row) != len(keys.parameters) for row in keys.factor):

@@ -214,6 +214,10 @@ def test_an_instance_that_fails_does_not_disturb_those_beside_it(tmp_path, versi
             {"parameters": {"arm.slew": np.array([1.0, 2.0])}},
             "parameter 'arm.slew' must have 1 values, got 2",
         ),
+        (
+            {"limits": JointLimits(2.0, np.array(0.5), np.array(1.0))},
+            r"crane.fmu starts with joint_. out of the limits of its mapping, 0.5 to 1 rad, by",
+        ),
         ({"names": LogNames(("slew",))}, "names.joints must hold 2 names, got 1"),
         ({"period": 0.03}, "whole multiple of the plant's own step of 0.03 s"),
         ({"inputs": ()}, "inputs must be of length 1 or more"),

@@ -46,6 +46,8 @@ FILES: dict[str, str | bytes] = {  # name -> content
     "fine.yaml": INFO,
     "doubled.toml": 'width = 640\nintrinsics = "fine.yaml"\n',
     "twice.toml": FOUR_JOINTS + 'joint_names = ["a", "b", "c", "a"]\n',
+    "torn.toml": FOUR_JOINTS + 'joint_names = ["a", "b", "c\\nd", "e"]\n',
+    "again.yaml": f"{INFO}width: 320\n",
     "list.yaml": "kinematics:\n  - 1\n",
     "arm_mm.toml": "a = [0, -425]\nd = [0, 0]\nalpha = [0, 0]\njoint_lower = []\njoint_upper = []\njoint_speed = []\n",
     "no.fmu": "this is no archive",
@@ -284,6 +286,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("tune", "--robots", "8000"), "64000 seeds from 10000 on leave the tuning range 10000:20000"),
     # inputs that would lose data, or have no effect
     ((*RUN, "--robot", "twice.toml"), "each joint and feature needs a name of its own, got a, b, c, a"),
+    ((*RUN, "--robot", "torn.toml"), r"cannot have the name 'c\nd', which is long or cannot be printed"),
+    ((*RUN, "--sensing", "pixel", "--camera", "again.yaml"), "again.yaml is not valid YAML: width is there twice"),
     ((*RUN, "--sensing", "stereo", "--camera", "self.toml"), "is the second of a pair and must name no other"),
     ((*RUN, "--sensing", "pixel", "--camera", "binned.yaml"), "binning or a region (roi) leaves a part; write"),
     ((*RUN, "--sensing", "pixel", "--camera", "part.yaml"), "part.yaml is of a larger image"),

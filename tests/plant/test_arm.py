@@ -166,6 +166,7 @@ def calibration(**changes):
         (calibration(wrist_1={"z": float("nan")}), "holds a number that is not finite"),
         (None, "cannot be read: No such file"),
         (b"{ not: [yaml", "is not valid YAML"),
+        (calibration() + b"kinematics: 1\n", "is not valid YAML: kinematics is there twice"),
         (b"", "holds something that is not a number"),
         (b"other: 1\n", "lacks 'kinematics'"),
         (b"\xff\xfe\xfa\x00", "is no text in UTF-8; save it in this encoding"),

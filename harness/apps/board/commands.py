@@ -15,6 +15,7 @@ from servobench.harness.cli.options import FolderOption, Running, named_option, 
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import split_words
+from servobench.plant.contract.settings import suggest
 
 if TYPE_CHECKING:
     from servobench.harness.apps.board.protocol import Finding, Hear
@@ -91,6 +92,10 @@ def verify(
     if (folder / HEAD).exists():
         from servobench.harness.apps.board.examination import check_submission
 
+        if controller:
+            raise ConfigurationError(
+                f"{folder} is a submission, which brings its code: leave --controller out"
+            )
         _print_findings(partial(check_submission, folder, rerun or SUBMITTED_RERUNS))
         return
     codes = {}
@@ -103,7 +108,14 @@ def verify(
     _check_files(opened)
     if rerun is None:
         return
-    _print_findings(partial(recheck, opened, draw(opened.runs(), rerun), Given(codes)))
+    runs = opened.runs()
+    known = set(runs["controller"])
+    for name in codes:
+        if name not in known:
+            raise ConfigurationError(
+                f"--controller: no run of {folder} is of {name!r}: {suggest(name, sorted(known))}"
+            )
+    _print_findings(partial(recheck, opened, draw(runs, rerun), Given(codes)))
 
 
 def _check_files(folder: ResultsFolder) -> None:

@@ -9,6 +9,7 @@ import pytest
 from kit.command import python, servobench
 from kit.own import WHOLE, write
 from servobench.harness.apps.board.code import find_code
+from servobench.harness.apps.board.submission import HEAD
 from servobench.harness.apps.board.verification import Given, draw, first_difference, recheck
 from servobench.harness.batch.api import compare
 from servobench.harness.batch.results import RUNS, STEPS, ResultsFolder
@@ -84,6 +85,10 @@ def test_runs_of_methods_and_of_own_code_recur_bit_for_bit(tmp_path):
     assert said.returncode == 0, said
     assert said.stdout.count("6.3 runs recur: kinematic-") == 3
     assert said.stdout.endswith("findings: 0 wrong, 0 unknown\n")
+    misspelt = ("--rerun", 1, "--controller", "Mien=./mine.py")
+    said = python("-m", "servobench", "verify", "out", *misspelt, path=tmp_path)
+    assert said.returncode == 2, said
+    assert "no run of out is of 'Mien': did you mean 'Mine'" in said.stderr
 
 
 @pytest.mark.parametrize("code", BY_THE_WAY)
@@ -278,3 +283,12 @@ def test_code_without_runs_to_carry_out_is_refused_in_one_line(tmp_path, monkeyp
     for_one = ("--rerun", "1", "--controller", "mine.py")
     assert servobench(monkeypatch, "verify", "out", *for_one) == 2
     assert "--controller mine.py: wanted NAME=FILE" in capsys.readouterr().err
+    write(tmp_path, HONEST)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / HEAD).touch()
+    monkeypatch.chdir(tmp_path)
+    assert (
+        servobench(monkeypatch, "verify", "out", "--rerun", "1", "--controller", "Mine=mine.py")
+        == 2
+    )
+    assert "a submission, which brings its code" in capsys.readouterr().err
