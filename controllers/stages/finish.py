@@ -1,4 +1,4 @@
-"""The last stages, between law and command: feedforward, null-space centring (posture), and saturation (limit).
+"""The last stages, between law and command: feedforward, null-space centring (posture), saturation (limit), calming.
 
     dq = dq_law + Ĵ⁺ (y_ref(k + lead + 1) − y_ref(k + lead)) + κ (I − Ĵ⁺Ĵ) (q_c − q̂),   κ = 1 − exp(−K_n dt)
 
@@ -26,7 +26,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, repeat
 from servobench.plant.contract.signals import BoolArray, Observation
 
-PATIENCE = np.array(64.0)  # [1] bound at rest; halved six times in a row, it begins to count
+PATIENCE = 64.0  # [1] bound at rest; halved six times in a row, it begins to count
 SLOWEST = 1.0 / 64.0  # [1] least bound, by which the arm can still leave
 SLOWER = 0.5  # [1] factor on the bound after a turn
 FASTER = 1.25  # [1] the same after any other period
@@ -225,7 +225,7 @@ class Finish:
         """Return the state of calming at the start of a run; None without that aid."""
         if not self._aids.calming:
             return None
-        bound = np.broadcast_to(PATIENCE, observation.feature.shape[:-1])
+        bound = np.full(observation.feature.shape[:-1], PATIENCE)[()]
         return Pace(bound, np.zeros_like(observation.joint_position))
 
     def calm(
