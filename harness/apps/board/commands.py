@@ -15,7 +15,6 @@ from servobench.harness.cli.options import FolderOption, Running, named_option, 
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import split_words
-from servobench.plant.contract.settings import suggest
 
 if TYPE_CHECKING:
     from servobench.harness.apps.board.protocol import Finding, Hear
@@ -84,6 +83,7 @@ def verify(
     from servobench.harness.apps.board.verification import Given, draw, recheck
     from servobench.harness.batch.lock import current_holder
     from servobench.harness.batch.results import ResultsFolder
+    from servobench.plant.contract.settings import suggest
 
     if (holder := current_holder(folder)) is not None:
         say(f"{folder} is being written by {holder}")
