@@ -9,6 +9,7 @@ programs: they double these times.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import tempfile
 import time
@@ -44,9 +45,11 @@ LOGGED = f"run --plant kinematic --controller {HERE}/docs/examples/excite.py --t
 
 def seconds(checkout: Path, command: str, folder: Path) -> float | None:
     """Return the wall-clock time of a command of a checkout [s], None if it fails."""
-    program = checkout / ".venv" / "bin" / "servobench"
+    program = [checkout / ".venv" / "bin" / "servobench", *command.split()]
+    # The page is written with the path of its own packages, which would come before those of a checkout.
+    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     began = time.perf_counter()
-    done = subprocess.run([program, *command.split()], cwd=folder, capture_output=True, check=False)
+    done = subprocess.run(program, env=own, cwd=folder, capture_output=True, check=False)
     if done.returncode:
         return None
     return time.perf_counter() - began
