@@ -14,7 +14,7 @@ from functools import cached_property
 from importlib.resources import files
 from itertools import accumulate, product
 from math import prod
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class Group:
             yield scalar
 
 
-Groups = tuple[Group, ...]
+Groups: TypeAlias = tuple[Group, ...]
 
 
 class View(NamedTuple):

@@ -26,8 +26,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, repeat
 from servobench.plant.contract.signals import BoolArray, Observation
 
-PATIENCE = 64.0  # [1] bound at rest; halved six times in a row, it begins to count
-SLOWEST = 1.0 / 64.0  # [1] least bound, by which the arm can still leave
+PATIENCE = 64.0  # [1] usual bound; from the seventh halving in a row on, it is one
+CRAWLING = 1.0 / 64.0  # [1] bound at which no turn halves it further: the arm can still leave
 SLOWER = 0.5  # [1] factor on the bound after a turn
 FASTER = 1.25  # [1] the same after any other period
 MIN_ROOM = 1e-9  # [1] of its limit; a joint with less room is left out
@@ -146,7 +146,7 @@ def step_with_posture(
 class Pace(NamedTuple):
     """How fast the arm may go, by calming."""
 
-    bound: FloatArray  # (...), share of the joints' speed limits, if below 1
+    bound: FloatArray  # (...), share of the joints' speed limits; above 1 it is none yet
     command: FloatArray  # the last one, (..., n), rad/s
 
 
@@ -236,7 +236,7 @@ class Finish:
         Args:
             pace: the state.
             joint_velocity: within its limits, (..., n), rad/s.
-            limited: whether it was larger, (...).
+            limited: whether a larger one was wanted, (...).
 
         Returns:
             The new state, the joint velocity, and whether it is limited now.
@@ -245,7 +245,7 @@ class Finish:
         limited = limited | (size > pace.bound)
         turned = limited & (np.vecdot(joint_velocity, pace.command) < 0.0)
         bound = np.where(turned, SLOWER * pace.bound, FASTER * pace.bound)
-        bound = np.minimum(np.maximum(bound, SLOWEST), PATIENCE)
+        bound = np.minimum(np.maximum(bound, CRAWLING), PATIENCE)
         slowed = joint_velocity * (bound / np.maximum(size, bound))[..., None]
         joint_velocity = np.where((bound < 1.0)[..., None], slowed, joint_velocity)
         return Pace(bound, joint_velocity), joint_velocity, limited

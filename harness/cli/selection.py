@@ -17,9 +17,8 @@ if TYPE_CHECKING:
 
 ALL = "all"
 Complete: TypeAlias = Callable[[str], list[str]]  # returns the names that a word may become
-Choose: TypeAlias = Callable[
-    [str], str
-]  # returns the name for which a word stands; refuses a wrong word
+# Returns the name for which a word stands; refuses a wrong word
+Choose: TypeAlias = Callable[[str], str]
 
 
 class Names(NamedTuple):

@@ -37,7 +37,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch
 
 Floats32: TypeAlias = npt.NDArray[np.float32]
-Info: TypeAlias = dict[str, Any]  # facts, or options, by name
+Info: TypeAlias = dict[str, Any]  # facts beside an observation, by name
 FEATURE_BOUND = 10.0  # natural sizes, beyond which features and errors are clipped
 LATENESS_BOUND = 2.0  # [s] beyond which the lateness of a frame is clipped
 
@@ -236,7 +236,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         return self._rollout.observation
 
     def reset(
-        self, *, seed: int | None = None, options: Info | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats32, Info]:
         """Begin a run.
 
@@ -456,7 +456,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: Info | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Floats32, Info]:
         """Begin a run in every lane.
 

@@ -1,4 +1,4 @@
-"""Atomic writing of files, and reading of a user's TOML and CSV with errors of one line."""
+"""Atomic writing of files, and reading of a user's TOML, YAML and CSV with errors of one line."""
 
 from __future__ import annotations
 
@@ -46,11 +46,10 @@ PARTIAL = re.compile(r"\..+-\d+-\d+")
 
 Write: TypeAlias = Callable[[Path], object]  # makes a file or a folder at a path
 Read = TypeVar("Read")
-Times: TypeAlias = dict[Path, int]  # when files were changed [ns]; 0 for one that is not there
+Changes: TypeAlias = dict[Path, int]  # when files were changed [ns]; 0 for one that is not there
 
-_TIMES: ContextVar[Times] = ContextVar(
-    "times of the files that were read by whoever keeps what they hold"
-)
+# Changes of the files that the function which is called by `kept_while_unchanged` has read
+_CHANGES: ContextVar[Changes] = ContextVar("changes")
 
 
 def write_atomically(path: Path, write: Write) -> None:
@@ -126,7 +125,7 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
     It names another file that was read meanwhile and cannot be. Without a path, any file may be the one.
     """
     if path is not None and done == "read":
-        _TIMES.get({}).update(_times([path]))
+        _CHANGES.get({})[path] = _last_change(path)
     try:
         yield
     except OSError as error:
@@ -146,33 +145,34 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
 
 def kept_while_unchanged(read: Callable[..., Read]) -> Callable[..., Read]:
     """Keep what a function makes of files, by its arguments, until one of the files that it read is another one."""
-    kept: dict[tuple[Any, ...], tuple[Read, Times]] = {}
+    kept: dict[tuple[Any, ...], tuple[Read, Changes]] = {}
 
     @wraps(read)
     def find(*arguments: Any) -> Read:  # noqa: ANN401 - those of the function
-        if arguments not in kept or _times(kept[arguments][1]) != kept[arguments][1]:
-            times: Times = {}
-            token = _TIMES.set(times)
+        if arguments not in kept or not _are_unchanged(kept[arguments][1]):
+            noted: Changes = {}
+            token = _CHANGES.set(noted)
             try:
-                kept[arguments] = read(*arguments), times
+                kept[arguments] = read(*arguments), noted
             finally:
-                _TIMES.reset(token)
-        found, times = kept[arguments]
-        _TIMES.get({}).update(times)  # for one that keeps what it makes of this
+                _CHANGES.reset(token)
+        found, changes = kept[arguments]
+        # A function around this one that keeps its answer has to notice them, too.
+        _CHANGES.get({}).update(changes)
         return found
 
     return find
 
 
-def _times(paths: Iterable[Path]) -> Times:
-    """Return when files were changed."""
-    return {path: _time(path) for path in paths}
+def _are_unchanged(changes: Changes) -> bool:
+    return all(_last_change(path) == change for path, change in changes.items())
 
 
-def _time(path: Path) -> int:
+def _last_change(path: Path) -> int:
+    """Return when a file was changed [ns]; 0 where that is not known, and whoever reads it says why."""
     try:
         return path.stat().st_mtime_ns
-    except OSError:  # whoever reads it says why
+    except OSError:
         return 0
 
 
@@ -213,11 +213,11 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
 
 
 def yaml_loader() -> Any:  # noqa: ANN401 - a class of PyYAML's, which is not imported here
-    """Return a class that loads YAML and, other than PyYAML's own, refuses a key that a mapping has twice."""
+    """Return a class that loads YAML as `yaml.SafeLoader`, but raises a `yaml.YAMLError` for a key given twice."""
     import yaml  # noqa: PLC0415 - few commands read such a file
 
     class Loader(yaml.SafeLoader):
-        """Raises a `ValueError` for such a key."""
+        """`SafeLoader` takes the last of two equal keys."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
             keys = Counter(str(key.value) for key, _ in node.value)

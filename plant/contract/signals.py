@@ -28,7 +28,7 @@ BoolArray = npt.NDArray[np.bool_]
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 JOINT_UNIT = "rad"
 COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
-MAX_NAME = 100  # [letters] in the name of a joint or feature
+NAME_LENGTH = 100  # [letters] in the name of a joint or feature
 SETTLING_BAND = 0.005  # share of a feature's natural size: 5 mm on the UR5
 
 
@@ -66,7 +66,7 @@ class Channel:
             bound.flags.writeable = False
             object.__setattr__(self, name, bound)
         for name in self.names:
-            if not str(name).isprintable() or len(name) > MAX_NAME:
+            if not str(name).isprintable() or len(name) > NAME_LENGTH:
                 raise ValueError(
                     f"a joint or feature cannot have the name {name!r}, which is long or cannot be printed"
                 )

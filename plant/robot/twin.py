@@ -223,8 +223,9 @@ def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
             raise ValueError(
                 f"{what}: {keys.robot} has no parameter {name!r} there{did_you_mean(name, known)}"
             )
-    if len(set(keys.parameters)) < len(keys.parameters):
-        raise ValueError(f"{what}: parameters has a name twice")
+    for name in keys.parameters:
+        if keys.parameters.count(name) > 1:
+            raise ValueError(f"{what}: parameters names {name!r} twice")
     for name in TIMES:
         if keys.mean.get(name, 0.0) < 0.0:
             raise ValueError(f"{what}: mean.{name} must be at least 0 s, got {keys.mean[name]:g}")

@@ -146,7 +146,7 @@ BROKEN = {
     ),
     "pose = {": ("rate = 20.0 # {", 'camera.pose must have frame = "base"'),
     "command_delay = 0.02": ("lag = -0.02", "mean.lag must be at least 0 s, got -0.02"),
-    '"gear_elbow"]': ('"zero_elbow"]', "parameters has a name twice"),
+    '"gear_elbow"]': ('"zero_elbow"]', "parameters names 'zero_elbow' twice"),
     ", [0.0, 0.01, -0.01]]": (", [0.0]]", "each row of factor needs 3 numbers"),
     "4e-6": ("-4e-6", "covariance must be a symmetric, positive definite matrix"),
     "[mean]": ("[means]", "has no setting 'means': did you mean 'mean'"),

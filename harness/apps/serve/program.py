@@ -9,7 +9,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any, final
+from typing import Any, TypeAlias, final
 
 import numpy as np
 
@@ -25,7 +25,7 @@ SCRIPT_START = re.compile(rb"def [A-Za-z_]\w*\(")
 COMMAND = "input_int_register_0"
 COMMANDS = CONTROLLER["commands"]["names"].split()
 WITHOUT_ANSWER = frozenset(CONTROLLER["commands"]["without_answer"])
-Motion = Iterator[FloatArray]  # joint velocities [rad/s] of each period
+Motion: TypeAlias = Iterator[FloatArray]  # joint velocities [rad/s] of each period
 STOP_DECELERATION = 10.0  # [rad/s²] deceleration of an arm whose program ended
 LONGEST_MOVE = 300.0  # [s] with its settling
 POSITION_GAIN = 5.0  # [1/s] gain of moveJ with which such a drive does not swing
