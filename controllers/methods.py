@@ -10,44 +10,14 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from importlib import import_module
 from typing import Any, Generic, Self, TypeVar
 
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import ControllerEntry, RobotKnowledge
-from servobench.controllers.estimators import correntropy
-from servobench.controllers.estimators.constant import (
-    ConstantConfig,
-    ConstantEstimator,
-    TrueConfig,
-    TrueEstimator,
-)
 from servobench.controllers.estimators.estimator import Estimator
-from servobench.controllers.estimators.kalman import (
-    KalmanConfig,
-    RlsConfig,
-    RlsEstimator,
-    UkfConfig,
-    kalman_estimator,
-    ukf_estimator,
-)
-from servobench.controllers.estimators.projection import (
-    BroydenConfig,
-    CfdlConfig,
-    ProjectionEstimator,
-)
-from servobench.controllers.estimators.rbf import (
-    RbfConfig,
-    RbfEstimator,
-    RbfLyapunovConfig,
-    RbfLyapunovEstimator,
-)
-from servobench.controllers.estimators.robust_filter import RobustConfig, RobustEstimator
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Law
-from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
-from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.controllers.laws.pid import PidConfig, PidLaw
-from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.config import ControllerTraining, TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.servo import Servo, ServoController
@@ -59,37 +29,56 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class Part(Generic[Kind]):
-    """An estimator or a control law as `ESTIMATORS` and `LAWS` list it."""
+    """An estimator or a control law as `ESTIMATORS` and `LAWS` list it; its module is imported once it is used."""
 
-    config: type[Any]  # its settings, a frozen dataclass with a default for every field
-    # its class, called with settings and `RobotKnowledge`, and with `TrainedNetworks` where `trained`
-    make: Callable[..., Kind]
+    module: str  # below `servobench.controllers`
+    # The class of its settings, a frozen dataclass with a default for every field
+    config_name: str
+    # Its class, called with settings and `RobotKnowledge`, and with `TrainedNetworks` where `trained`
+    make_name: str
     needs_truth: bool = False  # whether it needs the true Jacobian
     trained: bool = False  # whether it starts from networks that are trained offline
 
+    @property
+    def config(self) -> type[Any]:
+        """The class of its settings."""
+        found: type[Any] = self._find(self.config_name)
+        return found
+
+    @property
+    def make(self) -> Callable[..., Kind]:
+        """Its class, or a function that makes it."""
+        found: Callable[..., Kind] = self._find(self.make_name)
+        return found
+
+    def _find(self, name: str) -> Any:  # noqa: ANN401 - anything that a module holds
+        return getattr(import_module(f"servobench.controllers.{self.module}"), name)
+
 
 ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
-    "constant": Part(ConstantConfig, ConstantEstimator),
-    "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
-    "ukf": Part(UkfConfig, ukf_estimator),
-    "kalman": Part(KalmanConfig, kalman_estimator),
-    "mckf": Part(correntropy.MckfConfig, correntropy.mckf_estimator),
-    "imcckf": Part(correntropy.ImcckfConfig, correntropy.imcckf_estimator),
-    "gmckf": Part(correntropy.GmckfConfig, correntropy.gmckf_estimator),
-    "rmckf": Part(correntropy.RmckfConfig, correntropy.rmckf_estimator),
-    "robust": Part(RobustConfig, RobustEstimator),
-    "broyden": Part(BroydenConfig, ProjectionEstimator),
-    "rls": Part(RlsConfig, RlsEstimator),
-    "rbf": Part(RbfConfig, RbfEstimator, trained=True),
-    "rbf_lyapunov": Part(RbfLyapunovConfig, RbfLyapunovEstimator, trained=True),
-    "cfdl": Part(CfdlConfig, ProjectionEstimator),
+    "constant": Part("estimators.constant", "ConstantConfig", "ConstantEstimator"),
+    "true": Part("estimators.constant", "TrueConfig", "TrueEstimator", needs_truth=True),
+    "ukf": Part("estimators.kalman", "UkfConfig", "ukf_estimator"),
+    "kalman": Part("estimators.kalman", "KalmanConfig", "kalman_estimator"),
+    "mckf": Part("estimators.correntropy", "MckfConfig", "mckf_estimator"),
+    "imcckf": Part("estimators.correntropy", "ImcckfConfig", "imcckf_estimator"),
+    "gmckf": Part("estimators.correntropy", "GmckfConfig", "gmckf_estimator"),
+    "rmckf": Part("estimators.correntropy", "RmckfConfig", "rmckf_estimator"),
+    "robust": Part("estimators.robust_filter", "RobustConfig", "RobustEstimator"),
+    "broyden": Part("estimators.projection", "BroydenConfig", "ProjectionEstimator"),
+    "rls": Part("estimators.kalman", "RlsConfig", "RlsEstimator"),
+    "rbf": Part("estimators.rbf", "RbfConfig", "RbfEstimator", trained=True),
+    "rbf_lyapunov": Part(
+        "estimators.rbf", "RbfLyapunovConfig", "RbfLyapunovEstimator", trained=True
+    ),
+    "cfdl": Part("estimators.projection", "CfdlConfig", "ProjectionEstimator"),
 }
 
 LAWS: dict[str, Part[Law[Any]]] = {
-    "pid": Part(PidConfig, PidLaw),
-    "mfac": Part(MfacConfig, MfacLaw),
-    "mpc": Part(MpcConfig, MpcLaw),
-    "rbfnn": Part(RbfnnConfig, RbfnnLaw, trained=True),
+    "pid": Part("laws.pid", "PidConfig", "PidLaw"),
+    "mfac": Part("laws.mfac", "MfacConfig", "MfacLaw"),
+    "mpc": Part("laws.mpc.mpc", "MpcConfig", "MpcLaw"),
+    "rbfnn": Part("laws.rbfnn", "RbfnnConfig", "RbfnnLaw", trained=True),
 }
 
 PUBLISHED = ":published"  # after the name of a method: without aids, its law as printed

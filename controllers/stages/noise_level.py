@@ -20,6 +20,7 @@ from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.lanes import branch
 
 LOG_RATIOS = np.log(2.0) * np.arange(-2, 8)  # [1] ln of σ_j relative to the guess
+RATIOS = np.exp(2.0 * LOG_RATIOS)  # [1] σ_j² relative to the guess
 LOG_DEVIATION = 1.5  # [1] prior deviation of ln σ
 FORGETTING = 0.99  # [1] f, what is left of the scores after a sample
 OUTLIER = 0.1  # [unit of the feature] deviation of outliers
@@ -72,8 +73,7 @@ def _learned(
     a = (multiple * level.guess)[..., None]
     b = np.maximum(other, 0.0)[..., None]
     K = count[..., None]
-    ratios = np.exp(2.0 * LOG_RATIOS)
-    s = a * ratios + b
+    s = a * RATIOS + b
     inlier = square[..., None] / s + K * np.log(s)
     outlier = K * np.log(OUTLIER**2) + OUTLIER_ODDS
     scores = FORGETTING * level.scores + np.minimum(inlier, outlier)

@@ -107,6 +107,7 @@ class Bars(progress.Progress):
             progress.TextColumn("left"),
             progress.TimeRemainingColumn(),
         )
+        shown = shown and console.is_terminal
         super().__init__(*counts, *further, *times, console=console, disable=not shown)
         self._lines, self._begun = Lines(), 0
 

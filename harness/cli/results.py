@@ -148,10 +148,10 @@ def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:
     from servobench.harness.run.result import COMPLETED
     from servobench.plant.contract.settings import remark
 
-    own = folder.manifest.get("own_controllers", {})
-    saturation = runs.reindex(columns=["controller", "saturation_fraction"])
-    for name, share in saturation.groupby("controller").median().itertuples():
-        if share > MAX_SATURATED and name in own:
+    commanded = runs.reindex(columns=["controller", "saturation_fraction"])
+    for name in folder.manifest.get("own_controllers", {}):
+        share = commanded.loc[commanded["controller"] == name, "saturation_fraction"].median()
+        if share > MAX_SATURATED:
             remark(
                 f"{name} commands more than a joint's limit in {share:.0%} of its periods; commands are in rad/s"
             )
@@ -159,18 +159,26 @@ def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
-def print_lacking(folder: ResultsFolder) -> None:
-    """Print in how many completed runs a metric of the user's has no value, and why in the first of them."""
+def print_lacking(folder: ResultsFolder) -> tuple[int, int]:
+    """Print in how many completed runs a metric of the user's has no value, and why in the first of them.
+
+    Returns:
+        The number of all runs, and of those that failed.
+    """
     from servobench.harness.run.result import COMPLETED
 
+    count = 0
+    failed = 0
     lacking = []
     for table in folder.iterate_runs(("run_id", "status", "reason")):
-        lacking += table[(table["status"] == COMPLETED) & (table["reason"] != "")].to_dict(
-            "records"
-        )
+        completed = table["status"] == COMPLETED
+        count += len(table)
+        failed += int((~completed).sum())
+        lacking += table[completed & (table["reason"] != "")].to_dict("records")
     if lacking:
         first = lacking[0]
         say(f"in {len(lacking)} runs, first in {first['run_id']}: {first['reason']}")
+    return count, failed
 
 
 def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
@@ -182,12 +190,8 @@ def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
         whole: whether the command was to carry out all runs of the batch.
     """
     from servobench.harness.batch.results import FAILURES, missing_line
-    from servobench.harness.run.result import COMPLETED
 
-    print_lacking(folder)
-    completed = [table["status"] == COMPLETED for table in folder.iterate_runs(("status",))]
-    count = sum(map(len, completed))
-    failed = sum(int((~each).sum()) for each in completed)
+    count, failed = print_lacking(folder)
     lack = missing_line(count, folder.run_count)
     if whole:
         say(lack)

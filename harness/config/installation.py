@@ -1,10 +1,11 @@
 """The installation: version and commit of servobench, and the extras that bring missing packages."""
 
 import os
+import re
 import subprocess
 import sys
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -93,13 +94,18 @@ OTHER_CHECKOUT = frozenset(  # variables by which a hook of git names a checkout
 )
 
 
-@cache  # to read it takes milliseconds, and a manifest has eleven
+@cache
 def installed_version(name: str = "servobench") -> str | None:
     """Return the version of a distribution; None where it is not installed."""
     try:
-        return version(name)
+        found = distribution(name)
     except PackageNotFoundError:
         return None
+    # To parse all that a distribution says of itself takes milliseconds, and a manifest has eleven
+    field = re.search("^Version: (.+)$", found.read_text("METADATA") or "", re.MULTILINE)
+    if field is None:
+        return found.version
+    return field[1]
 
 
 class CommitUnknown(Exception):
@@ -144,7 +150,8 @@ def blas_libraries() -> list[dict[str, Any]]:
     A library that threadpoolctl does not know has the name and the version with which numpy was built.
     """
     import numpy as np  # noqa: PLC0415 - the version is printed without it
-    from threadpoolctl import threadpool_info  # noqa: PLC0415 - likewise
+
+    from servobench.plant.contract.lanes import find_libraries  # noqa: PLC0415 - likewise
 
     found = [
         {
@@ -153,7 +160,7 @@ def blas_libraries() -> list[dict[str, Any]]:
             "kernel": each.get("architecture"),
             "threads": each["num_threads"],
         }
-        for each in threadpool_info()
+        for each in find_libraries().info()
         if each["user_api"] == "blas"
     ]
     if not found:
@@ -182,8 +189,10 @@ def read_commit(root: Path) -> str | None:
         if not built.is_file():
             return None
         return built.read_text(encoding="ascii").strip()
-    commit = _git(root, "rev-parse", "HEAD")
-    changed = _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
+    # One call tells the commit, a line "# branch.oid COMMIT", and a line without "#" for each file that differs.
+    lines = _git(root, "status", "--porcelain=v2", "--branch", "--", *CODE_FOLDERS).splitlines()
+    commit = lines[0].removeprefix("# branch.oid ")
+    changed = not lines[-1].startswith("#")
     return f"{commit}{DIRTY}" if changed else commit
 
 

@@ -184,12 +184,17 @@ def _identity(size: int) -> FloatArray:
     return identity
 
 
+def find_libraries() -> ThreadpoolController:
+    """Return the loaded libraries that have threads, those of linear algebra among them."""
+    _found[:] = [(len(sys.modules), ThreadpoolController())]
+    return _found[0][1]
+
+
 def one_thread() -> AbstractContextManager[object]:
     """Return a context in which linear algebra runs on one thread.
 
     The search for libraries takes milliseconds, so it is repeated only if a module was imported since the last one.
     """
-    modules = len(sys.modules)
-    if not _found or _found[0][0] != modules:
-        _found[:] = [(modules, ThreadpoolController())]
+    if not _found or _found[0][0] != len(sys.modules):
+        find_libraries()
     return _found[0][1].limit(limits=1)

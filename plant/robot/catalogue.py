@@ -32,7 +32,6 @@ from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_rob
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.twin import read_twin
 from servobench.plant.robot.ur5 import UR5
-from servobench.plant.robot.urdf_elements import RUN_XACRO
 from servobench.plant.robot.workspace import search_workspace, with_ball
 
 ROBOTS = {title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS} | {
@@ -72,6 +71,8 @@ def find_robot(text: str) -> Robot:
         return random_robot(int(number))
     before_link = text.partition("#")[0]
     if PurePath(before_link).suffix.lower() == ".xacro":
+        from servobench.plant.robot.urdf_elements import RUN_XACRO  # noqa: PLC0415 - as in `_read`
+
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
         known = suggest(text, ROBOTS)

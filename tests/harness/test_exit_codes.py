@@ -3,9 +3,12 @@
 import errno
 import re
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -170,3 +173,35 @@ def test_a_script_without_a_guard_ends_with_the_line_alone(tmp_path):
     assert re.fullmatch(
         "the worker processes cannot be started; a script .*__main__':`\n", ended.stderr
     )
+
+
+WAITING = """
+import atexit, ctypes, sys
+import servobench.__main__ as entry
+import servobench.harness.cli.main as main
+
+def command():
+    atexit.register(print, "registered for the end")
+    ctypes.CDLL(None).printf(b"written by a library\\n")
+    carried_out()
+
+carried_out, main.main = main.main, command
+entry.main()
+"""
+
+
+def test_a_command_that_succeeds_ends_at_once_and_loses_no_output(tmp_path):
+    ended = python("-c", WAITING, "tasks", path=tmp_path)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    for words in ("endurance", "registered for the end", "written by a library"):
+        assert ended.stdout.count(words) == 1
+
+
+def test_a_command_whose_output_is_lost_fails(tmp_path):
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "servobench", "tasks"],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False, cwd=tmp_path,
+        )  # fmt: skip
+    assert ended.returncode != 0
+    assert "No space left on device" in ended.stderr

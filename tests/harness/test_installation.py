@@ -101,7 +101,7 @@ def test_the_loaded_blas_is_named_with_its_version_kernel_and_threads():
 
 
 def test_a_blas_that_cannot_be_asked_has_the_name_that_numpy_was_built_with(monkeypatch):
-    monkeypatch.setattr(threadpoolctl, "threadpool_info", list)
+    monkeypatch.setattr(threadpoolctl.ThreadpoolController, "info", lambda _: [])
     built = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     assert blas_libraries() == [
         {"name": built["name"], "version": built["version"], "threads": None, "kernel": None}
