@@ -31,8 +31,11 @@ def main() -> None:
 
 
 def _leave(succeeded: list[bool]) -> None:
-    """End the process of a command that succeeded at once: to take its modules apart would cost a fortieth of a run."""
-    if not succeeded:
+    """End the process of a command that succeeded at once: to take its modules apart would cost a fortieth of a run.
+
+    Profilers and debuggers were there before, and have their own work to do at the end.
+    """
+    if not succeeded or sys.gettrace() or sys.getprofile():
         return
     import ctypes
 
