@@ -17,13 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-METHODS = (
-    "ukf_mfac",
-    "ukf_mfac:published",
-    "ukf_mpc:published",
-    "rbf_pid:published",
-    "rbfnn_mfac:published",
-)
+METHODS = ("ukf_mfac", "ukf_mfac:published", "rbfnn_mfac:published")
 PERIODS = 200  # of a run of the task random
 FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import measuring
-from measuring import PERIODS, microseconds, processor_time, resolved_runs
+from measuring import METHODS, PERIODS, microseconds, processor_time, resolved_runs
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
@@ -31,7 +31,6 @@ from servobench.plant.contract.signals import Observation, PlantSpec, trusted_ob
 
 PERIOD, FEATURES, BLOCK = 0.05, 3, 128
 PREVIEW = 20  # periods
-METHODS = "ukf_mfac", "ukf_mfac:published", "rbfnn_mfac:published"
 Lead = tuple[int, ...]
 Curve = tuple[list[int], list[float]]  # sizes and costs of a period of one run [s]
 Curves = dict[str, Curve]

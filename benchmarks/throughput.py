@@ -21,6 +21,7 @@ from measuring import METHODS, PERIODS, QUICK, microseconds, options, seeds, swe
 
 COMPILED = "--compiled"
 EQUIPPED = ("regression_mfac", "rbf_pid", "rbfnn_mfac", "ukf_mpc")
+ON_FMU = ("ukf_mfac", "rbfnn_mfac")  # the step of its plant is told apart
 IN_C = ("regression_mfac", "ukf_mfac", "rbf_pid", "rbfnn_mfac", "ukf_mfac:published")
 HERE = Path(__file__).resolve().parents[1]
 ALONE = """
@@ -112,40 +113,29 @@ def main() -> None:
         name: Path(path).resolve()
         for name, _, path in (each.partition("=") for each in given.against)
     }
-    plants, methods = ["kinematic", "fmu"], [*METHODS, *EQUIPPED]
-    counts, old_counts, alone, rounds = (256, 1280), (4, 84), 15, given.rounds
+    cases = [("kinematic", method) for method in (*METHODS, *EQUIPPED)]
+    cases += [("fmu", method) for method in ON_FMU]
+    counts, alone, rounds = (256, 1280), 15, given.rounds
     if given.quick:
-        plants, methods, counts, old_counts, alone, rounds = (
-            plants[:1],
-            methods[:1],
-            (2, 10),
-            (2, 4),
-            1,
-            1,
-        )
+        cases, counts, alone, rounds = cases[:1], (2, 10), 1, 1
     rows = []
-    for plant in plants:
-        for method in methods:
-            now = min(period_in_sweep(HERE, plant, method, *counts) for _ in range(rounds))
-            single = min(period_alone(HERE, plant, method, alone) for _ in range(rounds))
-            cells = [f"{1e6 * now:.1f} µs", f"{microseconds(single)} µs"]
-            if method in IN_C:
-                in_c = min(
-                    period_in_sweep(HERE, plant, method, *counts, COMPILED) for _ in range(rounds)
-                )
-                one = min(period_alone(HERE, plant, method, alone, COMPILED) for _ in range(rounds))
-                cells += [f"{1e6 * in_c:.1f} µs", f"{microseconds(one)} µs", f"{in_c / now:.2f}"]
-            else:
-                cells += ["–"] * 3
-            for checkout in others.values():
-                cells.append(
-                    f"**{ratio(period_in_sweep, now, checkout, plant, method, *old_counts)}**"
-                )
-                cells.append(ratio(period_alone, single, checkout, plant, method, alone))
-            rows.append([plant, f"`{method}`", *cells])
-    names = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]
-    in_c_names = ("in C, in a sweep", "in C, alone", "in C / numpy, in a sweep")
-    print(table(["plant", "method", "in a sweep", "alone", *in_c_names, *names], rows))
+    for plant, method in cases:
+        now = min(period_in_sweep(HERE, plant, method, *counts) for _ in range(rounds))
+        single = min(period_alone(HERE, plant, method, alone) for _ in range(rounds))
+        cells = [microseconds(now), microseconds(single), "–", "–"]
+        if method in IN_C:
+            in_c = min(
+                period_in_sweep(HERE, plant, method, *counts, COMPILED) for _ in range(rounds)
+            )
+            one = min(period_alone(HERE, plant, method, alone, COMPILED) for _ in range(rounds))
+            cells[2:] = microseconds(in_c), microseconds(one)
+        for checkout in others.values():
+            cells.append(f"**{ratio(period_in_sweep, now, checkout, plant, method, *counts)}**")
+            cells.append(ratio(period_alone, single, checkout, plant, method, alone))
+        rows.append([plant, f"`{method}`", *cells])
+    older = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]
+    times = ("in a sweep [µs]", "alone", "in C, in a sweep", "alone")
+    print(table(["plant", "method", *times, *older], rows))
 
 
 if __name__ == "__main__":
