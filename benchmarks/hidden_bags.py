@@ -21,8 +21,8 @@ from scipy.interpolate import CubicSpline
 
 import servobench
 from measuring import options
-from servobench.harness.apps.twin.identification import read_log
 from servobench.harness.apps.twin.joining import joined
+from servobench.harness.apps.twin.log import read_log
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build

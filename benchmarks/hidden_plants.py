@@ -13,7 +13,7 @@ import pandas as pd
 import servobench
 from measuring import options
 from servobench.harness.apps.twin.drive import command_response
-from servobench.harness.apps.twin.identification import Log, read_log
+from servobench.harness.apps.twin.log import Log, read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import Settings

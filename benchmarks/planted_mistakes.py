@@ -19,7 +19,7 @@ from hidden_plants import draw_hidden
 
 import servobench
 from measuring import options
-from servobench.harness.apps.twin.identification import read_log
+from servobench.harness.apps.twin.log import read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.batch.logs import logged_in_file
 from servobench.harness.config.sensing import find_sensing

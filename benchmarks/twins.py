@@ -33,7 +33,7 @@ from servobench.harness.apps.studies.challenge import (
 )
 from servobench.harness.apps.studies.suite import judge
 from servobench.harness.apps.twin.drive import command_response
-from servobench.harness.apps.twin.identification import read_log
+from servobench.harness.apps.twin.log import read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.apps.twin.twin_file import twin_text
 from servobench.harness.config.description import toml

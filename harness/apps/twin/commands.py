@@ -21,7 +21,7 @@ from servobench.plant.contract.files import accessing, user_path, write_csv, wri
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from servobench.harness.apps.twin.identification import Clocks
+    from servobench.harness.apps.twin.log import Clocks
     from servobench.harness.apps.twin.summary import Answer
     from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import ResolvedRun
@@ -132,7 +132,7 @@ def identify(
     """
     from servobench.harness.apps.twin.drive import command_response
     from servobench.harness.apps.twin.held_out import held_out
-    from servobench.harness.apps.twin.identification import read_log
+    from servobench.harness.apps.twin.log import read_log
     from servobench.harness.apps.twin.preflight import mistakes
     from servobench.harness.apps.twin.summary import (
         Answer,

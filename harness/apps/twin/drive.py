@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from servobench.harness.apps.twin.identification import Log, correlation_time
+from servobench.harness.apps.twin.identification import correlation_time
+from servobench.harness.apps.twin.log import Log
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 

@@ -6,16 +6,12 @@ import numpy as np
 
 from servobench.harness.apps.twin.identification import (
     MAX_FRAMES,
-    MAX_LATENCY,
-    MIN_FRAMES,
-    Clocks,
     Identified,
-    Log,
     errors_along,
-    frames_of,
     identify,
     robust_covariance,
 )
+from servobench.harness.apps.twin.log import MAX_LATENCY, MIN_FRAMES, Clocks, Log, frames_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import PchipInterpolator
 
-from servobench.harness.apps.twin.identification import CAPTURED, MAX_LATENCY, Clocks
+from servobench.harness.apps.twin.log import CAPTURED, MAX_LATENCY, Clocks
 from servobench.harness.apps.twin.streams import (
     USUAL,
     Stream,

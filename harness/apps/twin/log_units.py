@@ -3,7 +3,7 @@
 import numpy as np
 
 from servobench.controllers.algebra import nearest_rotation
-from servobench.harness.apps.twin.identification import Log
+from servobench.harness.apps.twin.log import Log
 from servobench.harness.apps.twin.predictions import MAX_LATE, rms
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError

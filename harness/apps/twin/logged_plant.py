@@ -5,7 +5,7 @@ from typing import final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.apps.twin.identification import LOG, read_log
+from servobench.harness.apps.twin.log import LOG, read_log
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import numbers_of

@@ -30,7 +30,8 @@ from servobench.harness.apps.figures.style import (
     panel_grid,
 )
 from servobench.harness.apps.report.page import Picture, page_asset, page_policy, page_template
-from servobench.harness.apps.twin.identification import Log, whitened
+from servobench.harness.apps.twin.identification import whitened
+from servobench.harness.apps.twin.log import Log
 from servobench.harness.apps.twin.summary import Answer, estimates, handy, held_out_line, remarks
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_text

@@ -12,15 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.harness.apps.twin.identification import (
-    MIN_FRAMES,
-    OUTLIER,
-    Identified,
-    Log,
-    fit_cameras,
-    frames_of,
-    identify,
-)
+from servobench.harness.apps.twin.identification import OUTLIER, Identified, fit_cameras, identify
+from servobench.harness.apps.twin.log import MIN_FRAMES, Log, frames_of
 from servobench.harness.apps.twin.search import searched
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray

@@ -17,13 +17,8 @@ from servobench.controllers.stages.arm_fit import (
     Members,
     squared,
 )
-from servobench.harness.apps.twin.identification import (
-    Log,
-    fit_cameras,
-    frames_of,
-    played,
-    sees_pixels,
-)
+from servobench.harness.apps.twin.identification import fit_cameras, played, sees_pixels
+from servobench.harness.apps.twin.log import Log, frames_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.parametric import ParametricModel

@@ -8,13 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
-from servobench.harness.apps.twin.identification import (
-    EXTRAS,
-    OUTLIER,
-    Identified,
-    Log,
-    fitted_wave,
-)
+from servobench.harness.apps.twin.identification import EXTRAS, OUTLIER, Identified, fitted_wave
+from servobench.harness.apps.twin.log import Log
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 

@@ -8,15 +8,8 @@ import pandas as pd
 
 from servobench.harness.apps.twin.drive import MIN_MOTION, SUSPECT_SHARE, Response, untold_response
 from servobench.harness.apps.twin.held_out import HeldOut
-from servobench.harness.apps.twin.identification import (
-    EXTRAS,
-    Clocks,
-    Identified,
-    Log,
-    kind_of,
-    prior,
-    whitened,
-)
+from servobench.harness.apps.twin.identification import EXTRAS, Identified, kind_of, prior, whitened
+from servobench.harness.apps.twin.log import Clocks, Log
 from servobench.harness.apps.twin.sensor import lost_share, sensor
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel

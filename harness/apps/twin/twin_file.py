@@ -7,7 +7,8 @@ import numpy as np
 
 from servobench.harness.apps.twin.drive import Response
 from servobench.harness.apps.twin.held_out import HeldOut
-from servobench.harness.apps.twin.identification import EXTRAS, Identified, Log
+from servobench.harness.apps.twin.identification import EXTRAS, Identified
+from servobench.harness.apps.twin.log import Log
 from servobench.harness.apps.twin.sensor import frame_period, sensor
 from servobench.harness.config.description import toml
 from servobench.plant.contract.checks import FloatArray

@@ -26,9 +26,9 @@ from servobench.harness.apps.twin.identification import (
     correlation_time,
     fit_cameras,
     identify,
-    read_log,
     robust_covariance,
 )
+from servobench.harness.apps.twin.log import read_log
 from servobench.harness.apps.twin.preflight import mistakes
 from servobench.harness.apps.twin.sensor import frame_period, lost_share, sensor
 from servobench.harness.apps.twin.summary import estimates, remarks

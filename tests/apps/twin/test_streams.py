@@ -9,8 +9,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from servobench.harness.apps.twin.identification import Clocks, identify, read_log
+from servobench.harness.apps.twin.identification import identify
 from servobench.harness.apps.twin.joining import _in_rows, joined
+from servobench.harness.apps.twin.log import Clocks, read_log
 from servobench.harness.apps.twin.summary import remarks
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.run.experiment import build

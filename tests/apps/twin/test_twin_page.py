@@ -11,7 +11,8 @@ import pytest
 from servobench import run
 from servobench.harness.apps.twin.drive import command_response
 from servobench.harness.apps.twin.held_out import held_out
-from servobench.harness.apps.twin.identification import identify, read_log
+from servobench.harness.apps.twin.identification import identify
+from servobench.harness.apps.twin.log import read_log
 from servobench.harness.apps.twin.page import region_of
 from servobench.harness.apps.twin.summary import Answer, held_out_line
 from servobench.harness.apps.twin.twin_file import twin_text
