@@ -43,7 +43,7 @@ def describe_machine() -> str:
     for name in ("numpy", "scipy"):
         words += [name, str(installed_version(name))]
     for library in blas_libraries():
-        words += [library["name"], library["version"], str(library["kernel"])]
+        words += [str(library[key]) for key in ("name", "version", "kernel")]
     simd = np.show_config(mode="dicts")["SIMD Extensions"]
     words += simd.get("found", [])[-1:]
     return " ".join(words)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kit.command import finish, servobench, start
+from servobench.harness.apps.board import selftest
 from servobench.harness.apps.board.selftest import METHODS, read_reference
 from servobench.harness.apps.board.selftest import compare as held_against
 from servobench.harness.batch.api import compare
@@ -61,3 +62,9 @@ def test_the_reference_is_of_this_code_wherever_the_machine_is_that_of_the_refer
 def test_a_plant_without_stored_numbers_is_refused_in_one_line(monkeypatch, capsys):
     assert servobench(monkeypatch, "selftest", "--plants", "fmu") == 2
     assert "--plants: fmu has no reference" in capsys.readouterr().err
+
+
+def test_a_blas_without_a_version_is_told_as_such(monkeypatch):
+    unknown = {"name": "mkl", "version": None, "kernel": None, "threads": 1}
+    monkeypatch.setattr(selftest, "blas_libraries", lambda: [unknown])
+    assert "mkl None None" in selftest.describe_machine()
