@@ -67,6 +67,27 @@ sys.stderr.write(' '.join(sorted(set(sys.modules) & {unused!r})))
     assert done.stderr == ""
 
 
+def test_a_run_loads_the_law_and_the_estimator_of_its_method_alone(tmp_path):
+    script = f"""
+import sys
+out = {str(tmp_path / "out")!r}
+sys.argv = ["servobench", "run", "regression_mfac", "--plant", "kinematic", "--no-figures", "--out", out]
+from servobench.harness.cli.main import main
+try:
+    main()
+except SystemExit as end:
+    assert not end.code
+parts = ("servobench.controllers.laws.", "servobench.controllers.estimators.")
+sys.stderr.write(' '.join(sorted(name for name in sys.modules if name.startswith(parts))))
+"""
+    used = {
+        name.removeprefix("servobench.controllers.") for name in python("-c", script).stderr.split()
+    }
+    # The pseudo-inverse is that of the fingerprint's run.
+    wanted = {"estimators.constant", "estimators.estimator", "laws.law", "laws.mfac", "laws.pid"}
+    assert used == wanted
+
+
 def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
     done = servobench_without(EXTRAS, (*QUICK, "--report"), tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
