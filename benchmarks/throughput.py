@@ -21,7 +21,7 @@ from measuring import METHODS, PERIODS, QUICK, microseconds, options, seeds, swe
 
 COMPILED = "--compiled"
 EQUIPPED = ("regression_mfac", "rbf_pid", "rbfnn_mfac", "ukf_mpc")
-ON_FMU = ("ukf_mfac", "rbfnn_mfac")  # the step of its plant is told apart
+ON_FMU = ("ukf_mfac", "rbfnn_mfac")  # all methods add the same time of this plant
 IN_C = ("regression_mfac", "ukf_mfac", "rbf_pid", "rbfnn_mfac", "ukf_mfac:published")
 HERE = Path(__file__).resolve().parents[1]
 ALONE = """
@@ -134,7 +134,7 @@ def main() -> None:
             cells.append(ratio(period_alone, single, checkout, plant, method, alone))
         rows.append([plant, f"`{method}`", *cells])
     older = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]
-    times = ("in a sweep [µs]", "alone", "in C, in a sweep", "alone")
+    times = ("in a sweep [µs]", "alone", "in C, in a sweep", "in C, alone")
     print(table(["plant", "method", *times, *older], rows))
 
 

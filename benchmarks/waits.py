@@ -38,6 +38,9 @@ COMMANDS: dict[str, str] = {
     "identify, one log": f"identify {LOG} --out {{out}}.toml",
     "export of an equipped controller as FMU": "fmu export --controller regression_mfac -o {out}.fmu",
 }
+# Of the process that writes the page: its packages would come before those of a checkout, and without bytecode each
+# command would compile all modules of a checkout anew.
+OF_THE_PAGE = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
 ALL = {"robots": 1000, "rendered": 100, "few": 20, "trials": 10}
 FEW = {"robots": 2, "rendered": 1, "few": 1, "trials": 1}
 LOGGED = f"run --plant kinematic --controller {HERE}/docs/examples/excite.py --task circle --no-figures --out {LOG}"
@@ -46,8 +49,7 @@ LOGGED = f"run --plant kinematic --controller {HERE}/docs/examples/excite.py --t
 def seconds(checkout: Path, command: str, folder: Path) -> float | None:
     """Return the wall-clock time of a command of a checkout [s], None if it fails."""
     program = [checkout / ".venv" / "bin" / "servobench", *command.split()]
-    # The page is written with the path of its own packages, which would come before those of a checkout.
-    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    own = {name: value for name, value in os.environ.items() if name not in OF_THE_PAGE}
     began = time.perf_counter()
     done = subprocess.run(program, env=own, cwd=folder, capture_output=True, check=False)
     if done.returncode:

@@ -210,7 +210,6 @@ class Regression:
         self._m = m
         self._n = n
         self._pairs = np.triu_indices(n)
-        self._products = np.arange(len(self._pairs[0]))
         lower, upper = knowledge.region or (spec.joint_lower, spec.joint_upper)
         self._centre: FloatArray = (lower + upper) / 2.0
 
@@ -345,9 +344,10 @@ class Regression:
         """Return the derivatives of the products r_j r_k (j < k) and r_j²/2, (..., n (n+1)/2, n), at r = q − q_c."""
         first, second = self._pairs
         r = joint_position - self._centre
+        rows = np.arange(len(first))
         derivative = np.zeros((*r.shape[:-1], len(first), self._n))
-        derivative[..., self._products, first] = r[..., second]
-        derivative[..., self._products, second] = r[..., first]
+        derivative[..., rows, first] = r[..., second]
+        derivative[..., rows, second] = r[..., first]
         return derivative
 
     def _streak(self, state: RegressionState, found: Innovation, last: FloatArray) -> IntArray:

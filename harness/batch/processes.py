@@ -24,6 +24,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NoReturn
 
+import psutil
+
 from servobench.harness.batch.container import memory_limit, processor_limit
 
 LINUX = sys.platform == "linux"  # other systems: macOS is provided for
@@ -75,8 +77,6 @@ class Bounds:
 
 def _foreign_memory(count: int) -> float:
     """Return the memory limit [bytes] of each of `count` concurrent runs of foreign code."""
-    import psutil  # noqa: PLC0415 - most batches have no foreign code, and end sooner without it
-
     machine = float(psutil.virtual_memory().total)
     memory = FOREIGN_SHARE * min(machine, memory_limit())
     share = memory / count
@@ -270,10 +270,8 @@ def own_memory(processes: Iterable[int]) -> int:
     return total
 
 
-def _ask(process: int, question: Callable[[Any], Any]) -> Any:  # noqa: ANN401 - any answer
+def _ask(process: int, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer
     """Return the answer of the system about a process; None if it has ended."""
-    import psutil  # noqa: PLC0415 - as above
-
     try:
         return question(psutil.Process(process))
     except psutil.Error:
@@ -287,8 +285,6 @@ def limit_resources(memory: float) -> None:
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     if memory < math.inf and LINUX:
-        import psutil  # noqa: PLC0415 - as above
-
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
         # The largest number of the system
         soft = min(psutil.Process().memory_info().vms + int(memory), sys.maxsize)

@@ -159,26 +159,18 @@ def print_faults(folder: ResultsFolder, runs: pd.DataFrame) -> None:
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
-def print_lacking(folder: ResultsFolder) -> tuple[int, int]:
-    """Print in how many completed runs a metric of the user's has no value, and why in the first of them.
-
-    Returns:
-        The number of all runs, and of those that failed.
-    """
+def print_lacking(folder: ResultsFolder) -> None:
+    """Print in how many completed runs a metric of the user's has no value, and why in the first of them."""
     from servobench.harness.run.result import COMPLETED
 
-    count = 0
-    failed = 0
     lacking = []
     for table in folder.iterate_runs(("run_id", "status", "reason")):
-        completed = table["status"] == COMPLETED
-        count += len(table)
-        failed += int((~completed).sum())
-        lacking += table[completed & (table["reason"] != "")].to_dict("records")
+        lacking += table[(table["status"] == COMPLETED) & (table["reason"] != "")].to_dict(
+            "records"
+        )
     if lacking:
         first = lacking[0]
         say(f"in {len(lacking)} runs, first in {first['run_id']}: {first['reason']}")
-    return count, failed
 
 
 def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
@@ -190,8 +182,12 @@ def judge(folder: ResultsFolder, *, strict: bool, whole: bool = True) -> None:
         whole: whether the command was to carry out all runs of the batch.
     """
     from servobench.harness.batch.results import FAILURES, missing_line
+    from servobench.harness.run.result import COMPLETED
 
-    count, failed = print_lacking(folder)
+    print_lacking(folder)
+    completed = [table["status"] == COMPLETED for table in folder.iterate_runs(("status",))]
+    count = sum(map(len, completed))
+    failed = sum(int((~each).sum()) for each in completed)
     lack = missing_line(count, folder.run_count)
     if whole:
         say(lack)

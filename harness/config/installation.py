@@ -1,11 +1,10 @@
 """The installation: version and commit of servobench, and the extras that bring missing packages."""
 
 import os
-import re
 import subprocess
 import sys
 from functools import cache
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -94,18 +93,13 @@ OTHER_CHECKOUT = frozenset(  # variables by which a hook of git names a checkout
 )
 
 
-@cache
+@cache  # to read it takes milliseconds, and a manifest has eleven
 def installed_version(name: str = "servobench") -> str | None:
     """Return the version of a distribution; None where it is not installed."""
     try:
-        found = distribution(name)
+        return version(name)
     except PackageNotFoundError:
         return None
-    # To parse all that a distribution says of itself takes milliseconds, and a manifest has eleven
-    field = re.search("^Version: (.+)$", found.read_text("METADATA") or "", re.MULTILINE)
-    if field is None:
-        return found.version
-    return field[1]
 
 
 class CommitUnknown(Exception):
@@ -192,6 +186,8 @@ def read_commit(root: Path) -> str | None:
     # One call tells the commit, a line "# branch.oid COMMIT", and a line without "#" for each file that differs.
     lines = _git(root, "status", "--porcelain=v2", "--branch", "--", *CODE_FOLDERS).splitlines()
     commit = lines[0].removeprefix("# branch.oid ")
+    if commit == "(initial)":
+        raise CommitUnknown("the checkout has no commit yet")
     changed = not lines[-1].startswith("#")
     return f"{commit}{DIRTY}" if changed else commit
 

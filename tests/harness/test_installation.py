@@ -55,6 +55,10 @@ def has_a_damaged_index(folder, monkeypatch):
     (folder / ".git" / "index").write_bytes(b"damaged")
 
 
+def has_no_commit(folder, monkeypatch):
+    git(folder, "checkout", "-q", "--orphan", "fresh")
+
+
 def points_nowhere(folder, monkeypatch):
     (folder / ".git").rename(folder / "moved")
     (folder / ".git").write_text("gitdir: /nowhere/at/all\n")
@@ -70,6 +74,7 @@ def points_nowhere(folder, monkeypatch):
         (has_no_git, "^git cannot be run: No such file"),
         (has_a_damaged_index, "^git says: .*index file"),
         (points_nowhere, "^git says: not a git repository: /nowhere/at/all"),
+        (has_no_commit, "^the checkout has no commit yet$"),
     ],
 )
 def test_an_unknown_commit_has_its_reason(spoil, reason, checkout, monkeypatch):
