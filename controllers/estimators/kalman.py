@@ -322,37 +322,9 @@ class RlsConfig:
             )
 
 
-def rls_update(
-    J: FloatArray,
-    P: FloatArray,
-    joint_step: FloatArray,
-    feature_step: FloatArray,
-    *,
-    forgetting: FloatArray,
-) -> Corrected:
-    """Correct by one motion, P in Joseph form.
-
-    Args:
-        J: (..., m, n), m/rad.
-        P: (..., n, n), 1/rad².
-        joint_step: Δq, (..., n), rad.
-        feature_step: Δy, (..., m), m.
-        forgetting: λ, (...).
-
-    Returns:
-        The new Jacobian and P.
-    """
-    PH = np.matvec(P, joint_step)
-    s = forgetting + np.vecdot(joint_step, PH)
-    K = PH / s[..., None]
-    P = joseph(P, PH, K, joint_step, forgetting) / forgetting[..., None, None]
-    nu = feature_step - np.matvec(J, joint_step)
-    return J + outer(nu, K), symmetric(P)
-
-
 @final
 class RlsEstimator(GatedEstimator[WalkState]):
-    """Ĵ ← Ĵ + (Δy − ĴΔq) Kᵀ with forgetting λ; motions below a minimum ‖Δq‖ are left out.
+    """`split_update` with r = λ, and P/λ after it; motions below a minimum ‖Δq‖ are left out.
 
     Forgetting inflates P in directions in which nothing moves, without bound. So P is scaled back to a mean diagonal
     of at most `covariance_limit`; scaling keeps it symmetric and positive definite.
@@ -370,9 +342,8 @@ class RlsEstimator(GatedEstimator[WalkState]):
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         config = self._config
         forgetting = np.exp(-np.asarray(motion.duration) / config.memory)
-        J, P = rls_update(
-            state.J, state.P, motion.joint_step, motion.feature_step, forgetting=forgetting
-        )
+        J, P = split_update(state.J, state.P, motion.joint_step, motion.feature_step, r=forgetting)
+        P = P / forgetting[..., None, None]
         kept = np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))
         P = P * kept[..., None, None]
         cholesky_of(P)

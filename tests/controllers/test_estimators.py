@@ -28,7 +28,6 @@ from servobench.controllers.estimators.kalman import (
     RlsEstimator,
     UkfConfig,
     kalman_estimator,
-    rls_update,
     sigma_weights,
     split_update,
     ukf_estimator,
@@ -64,6 +63,16 @@ def kalman_update(J, P, joint_step, feature_step, *, r):
     nu = feature_step - np.matvec(H, x)
     x = x + np.matvec(K, nu)
     return x.reshape(J.shape), (P + P.mT) / 2
+
+
+def forgetting_update(J, P, joint_step, feature_step, forgetting):
+    """Correct by one motion with recursive least squares, after which P may be as large as it likes."""
+    config = RlsConfig(memory=1.0, covariance_limit=1e12, min_joint_step=0.0)
+    estimator = RlsEstimator(config)
+    state = estimator.start(J)._replace(P=P)
+    given = motion(joint_step, feature_step, duration=-np.log(forgetting))
+    after = estimator.update(state, given)
+    return after.J, after.P
 
 
 def random_motions(n, m, count, seed=3):
@@ -123,13 +132,7 @@ def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq,
 
 def test_the_first_step_of_least_squares_equals_the_one_computed_by_hand():
     # PΔq = (2, 2), K = (2, 2) / (0.5 + 4), misfit 0.2; P = (2I − (2, 2)(2, 2)ᵀ / 4.5) / 0.5
-    J, P = rls_update(
-        np.array([[0.1, 0.1]]),
-        2.0 * np.eye(2),
-        np.ones(2),
-        np.array([0.4]),
-        forgetting=np.asarray(0.5),
-    )
+    J, P = forgetting_update(np.array([[0.1, 0.1]]), 2.0 * np.eye(2), [1.0, 1.0], [0.4], 0.5)
     np.testing.assert_allclose(J, [[0.1 + 0.4 / 4.5] * 2], atol=1e-15)
     np.testing.assert_allclose(P, 2.0 * (2.0 * np.eye(2) - 4.0 / 4.5), atol=1e-14)
 
@@ -200,10 +203,9 @@ def test_least_squares_forgets_by_the_time_of_a_motion():
     estimator = RlsEstimator(RlsConfig(memory=2.0))
     begun = estimator.start(np.zeros((1, 2)))
     for duration in (0.1, 0.5):
-        J, _ = rls_update(begun.J, begun.P, dq, dy, forgetting=np.exp(np.array(-duration / 2.0)))
-        np.testing.assert_array_equal(
-            estimator.update(begun, motion(dq, dy, duration=duration)).J, J
-        )
+        after = estimator.update(begun, motion(dq, dy, duration=duration))
+        J, _ = split_update(begun.J, begun.P, dq, dy, r=np.exp(np.array(-duration / 2.0)))
+        np.testing.assert_array_equal(after.J, J)
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4))
@@ -244,7 +246,7 @@ def test_recursive_least_squares_equals_weighted_batch_least_squares(forgetting)
     J = J0
     P = P0
     for dq, dy in zip(DQ, DY, strict=True):
-        J, P = rls_update(J, P, dq, dy, forgetting=np.asarray(forgetting))
+        J, P = forgetting_update(J, P, dq, dy, forgetting)
     weights = np.sqrt(forgetting ** np.arange(count - 1, -1, -1))[:, None]
     prior = np.sqrt(forgetting**count) * np.diag(1 / np.sqrt(np.diag(P0)))
     A = np.vstack([weights * DQ, prior])
