@@ -62,7 +62,7 @@ class InitialJacobian(ABC, Generic[State]):
     def step(self, state: State, observation: Observation) -> tuple[State, FloatArray, BoolArray]:
         """Return the new state, a velocity (..., n) [rad/s] of a probing move, and whether Ĵ₀ is known now, (...)."""
         velocity = np.zeros_like(observation.joint_position)
-        known = np.full(observation.feature.shape[:-1], True)
+        known = np.full(observation.lead, True)
         return state, velocity, known
 
     @abstractmethod
@@ -148,7 +148,7 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
 
     def start(self, observation: Observation) -> ProbeState:
         """Return the state at the first rest, which is the start of the run."""
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         n = self._spec.n
         m = self._spec.m
         none = np.zeros(lead, dtype=np.int_)

@@ -128,7 +128,7 @@ class Servo:
         observation = self._natural(observation)
         initial = self.initial.start(observation)
         known = self.initial.immediate
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         if known:
             jacobian = self.initial.jacobian(initial)
         else:

@@ -70,7 +70,7 @@ class PidLaw(Law[PidState]):
     def start(self, observation: Observation) -> PidState:
         """Return zero integral and derivative."""
         zero = np.zeros(observation.feature.shape)
-        never = np.full(observation.feature.shape[:-1], np.inf)
+        never = np.full(observation.lead, np.inf)
         return PidState(
             integral=zero,
             derivative=zero,

@@ -238,7 +238,7 @@ class RbfnnLaw(Law[RbfnnState]):
     def start(self, observation: Observation) -> RbfnnState:
         """Return the state of the offline network."""
         network = self._network
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         q = observation.joint_position
         learned = np.zeros((*lead, *network.weights.shape))
         unknown = np.full((*lead, self._error_rows, network.m), np.nan)

@@ -175,7 +175,7 @@ class Calibration:
 
     def start(self, observation: Observation) -> CalibrationState:
         """Return the state before any frame."""
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         q = observation.joint_position
         fit = self.fit
         m = self._m

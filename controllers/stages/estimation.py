@@ -89,7 +89,7 @@ class Estimation:
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:
         """Return the state before any motion, starting from Ĵ₀, (..., m, n), at rest."""
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         q = observation.joint_position
         base = self._given(q, jacobian)
         deviation = jacobian
@@ -142,7 +142,7 @@ class Estimation:
         jacobian = own
         if self.pairing is not None:
             jacobian = self._with_model(own, learned, q, learned.pair.base)
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
         this = LastFrame(time, q, observation.feature, observation.valid, jacobian)
         return EstimationState(learned, choose(due, this, last), jacobian, own)

@@ -225,7 +225,7 @@ class Finish:
         """Return the state of calming at the start of a run; None without that aid."""
         if not self._aids.calming:
             return None
-        bound = np.full(observation.feature.shape[:-1], PATIENCE)[()]
+        bound = np.full(observation.lead, PATIENCE)[()]
         return Pace(bound, np.zeros_like(observation.joint_position))
 
     def calm(

@@ -328,7 +328,7 @@ class Pairing:
     def start(self, observation: Observation, base: FloatArray) -> PairState:
         """Return the state of an arm that has rested, with J_n (..., m, n) there."""
         q = observation.joint_position
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         m = self._m
         frame = self._aids.feature_noise**2
         no_motion = np.zeros((*lead, m))

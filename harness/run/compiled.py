@@ -136,7 +136,7 @@ class CompiledServo(Servo):
     def start(self, observation: Observation) -> Any:  # noqa: ANN401 - a state of its own
         """See `Servo.start`."""
         spec = self.knowledge.spec
-        unknown = np.zeros((*observation.feature.shape[:-1], 1 + self.knowledge.preview, spec.m))
+        unknown = np.zeros((*observation.lead, 1 + self.knowledge.preview, spec.m))
         x, _ = self._recorded.start(_row(observation, unknown))
         return CompiledState(x, np.full((*x.shape[:-1], spec.m, spec.n), np.nan))
 
@@ -172,7 +172,7 @@ class CompiledServo(Servo):
 
 def _row(observation: Observation, reference: FloatArray) -> FloatArray:
     """Return the columns of a recorded step, (..., inputs)."""
-    lead = observation.feature.shape[:-1]
+    lead = observation.lead
     parts = (
         np.full((*lead, 1), observation.time),
         observation.joint_position,

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import (
     FloatArray,
+    Shape,
     as_array,
     check_number,
     is_finite,
@@ -224,6 +225,11 @@ class Observation:
                 f"capture_time must be a time in s, or NaN for none, got {captured.tolist()}"
             )
         object.__setattr__(self, "capture_time", float(captured))
+
+    @property
+    def lead(self) -> Shape:
+        """The leading axes of all arrays: () for a single run."""
+        return self.feature.shape[:-1]
 
     def with_values(self, joint_position: FloatArray, feature: FloatArray) -> Observation:
         """Return this observation with other joint positions and another feature, which are finite."""

@@ -192,7 +192,7 @@ class MpcLaw(Law[MpcState]):
 
     def start(self, observation: Observation) -> MpcState:
         """Return the state of an arm at rest."""
-        lead = observation.feature.shape[:-1]
+        lead = observation.lead
         n = self._spec.n
         m = self._spec.m
         moves = self._shape.moves
