@@ -192,16 +192,16 @@ class Writer:
     def note(self, operand: Operand) -> None:
         """Note that entries are read now, and those that they are made of in the same expression."""
         node = operand.node
-        places = operand.places.reshape(-1)
+        places = operand.flat
         inside = self.is_inside(node)
         if not inside:
             self.reads[node].append(Read(self.clock, places))
         if node.operation == JOIN:
             for part, _, among in parts(node, places):
-                self.note(Operand(part.node, part.places.reshape(-1)[among]))
+                self.note(Operand(part.node, part.flat[among]))
         elif inside:
             for each in node.operands:
-                self.note(Operand(each.node, each.places.reshape(-1)[places]))
+                self.note(Operand(each.node, each.flat[places]))
 
     def array(self, size: int) -> Entries:
         """Return a new array."""
@@ -224,7 +224,7 @@ class Writer:
     def value(self, operand: Operand) -> Value:
         """Return entries as an expression."""
         node = operand.node
-        places = operand.places.reshape(-1)
+        places = operand.flat
         if node in self.found:
             return Value("{}", [self.where(node, places)])
         if node.operation == NUMBERS:
@@ -236,7 +236,7 @@ class Writer:
 
     def mapped(self, node: Node, places: Places) -> Value:
         """Return entries of an operation, entry by entry."""
-        read = [each._replace(places=each.places.reshape(-1)[places]) for each in node.operands]
+        read = [each._replace(places=each.flat[places]) for each in node.operands]
         values = [self.value(each) for each in read]
         text = node.detail.format(*(each.text for each in values))
         return Value(text, [entries for each in values for entries in each.entries])
@@ -253,7 +253,7 @@ class Writer:
         """Return where entries are if a node may overwrite them; the few that are read later are kept elsewhere."""
         if operand.node not in self.found:
             return None
-        array, places = self.where(operand.node, operand.places.reshape(-1))
+        array, places = self.where(operand.node, operand.flat)
         if array != self.found[operand.node].array or array == INPUTS:
             return None
         target = Entries(array, places)
@@ -304,11 +304,11 @@ class Writer:
         if node.operation != JOIN or node in self.found:
             return [(places, self.value(operand), shape)]
         found = []
-        for part, among, inside in parts(node, operand.places.reshape(-1)):
+        for part, among, inside in parts(node, operand.flat):
             form: Shape = among.shape
             if np.array_equal(inside, np.arange(part.places.size)):
                 form = part.places.shape
-            own = Operand(part.node, part.places.reshape(-1)[inside])
+            own = Operand(part.node, part.flat[inside])
             found += self.pieces(places[among], own, form)
         return found
 
@@ -413,7 +413,7 @@ class Writer:
         for operand in node.operands:
             own = None
             if operand.node in self.found:
-                own = self.where(operand.node, operand.places.reshape(-1))
+                own = self.where(operand.node, operand.flat)
             if own is None or not np.array_equal(
                 own.places, own.places[0] + np.arange(own.places.size)
             ):

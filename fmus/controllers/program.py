@@ -42,6 +42,11 @@ class Operand(NamedTuple):
     node: Node
     places: Places
 
+    @property
+    def flat(self) -> Places:
+        """The places in one row."""
+        return self.places.reshape(-1)
+
 
 @dataclass(eq=False)
 class Node:
@@ -172,5 +177,5 @@ def operand(node: Node, places: Places) -> Operand:
     if node.operation == JOIN and places.size:
         part, among, inside = next(parts(node, places.reshape(-1)))
         if among.size == places.size:
-            return operand(part.node, part.places.reshape(-1)[inside].reshape(places.shape))
+            return operand(part.node, part.flat[inside].reshape(places.shape))
     return Operand(node, np.ascontiguousarray(places).reshape(places.shape))
