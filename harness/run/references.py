@@ -24,6 +24,7 @@ from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.signals import Channel, column_unit
+from servobench.plant.robot.arm import from_frame
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
@@ -250,9 +251,7 @@ class FollowedCurve(ImageReference):
     def points(self, time: npt.ArrayLike) -> FloatArray:
         """Return the place at each time."""
         home = self.model.points(self.robot.workspace.home)
-        pose = self.model.camera
-        curve = self._in_camera(time)
-        place = np.matvec(pose[:3, :3], curve) + pose[:3, 3]
+        place = from_frame(self.model.camera, self._in_camera(time))
         about_middle = home - home.mean(axis=-2)
         return place[..., None, :] + about_middle
 

@@ -67,6 +67,16 @@ def rpy_from_rotation(R: FloatArray) -> FloatArray:
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
+def from_frame(pose: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points (..., 3) of a frame in the frame in which its pose, (..., 4, 4), is given."""
+    return np.matvec(pose[..., :3, :3], points) + pose[..., :3, 3]
+
+
+def into_frame(pose: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points (..., 3) in the frame with a pose, (..., 4, 4), that is given as they are; undoes `from_frame`."""
+    return np.vecmat(points - pose[..., :3, 3], pose[..., :3, :3])
+
+
 @dataclass(frozen=True, eq=False)
 class SerialArm:
     """A serial arm with n revolute joints and a ball on its flange.
@@ -170,8 +180,7 @@ class SerialArm:
 
     def ball(self, frames: FloatArray) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for `frames`."""
-        flange = frames[..., -1, :, :]
-        return np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3]
+        return from_frame(frames[..., -1, :, :], self.tool)
 
 
 def plain_arm(

@@ -17,7 +17,13 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, Shape, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
-from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
+from servobench.plant.robot.arm import (
+    JointLimits,
+    SerialArm,
+    from_frame,
+    into_frame,
+    narrow_limits,
+)
 
 # The ball centre, camera frame
 FEATURE = Channel(("x", "y", "z"), "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))
@@ -91,23 +97,17 @@ class RobotModel(ABC):
         """Return the target in the base frame, (..., p, 3) m, for poses of the flange, (..., 4, 4)."""
         if self.mount == "hand":
             return self.marks
-        R_BF = flange[..., None, :3, :3]
-        p_BF = flange[..., None, :3, 3]
-        return np.matvec(R_BF, self.marks) + p_BF
+        return from_frame(flange[..., None, :, :], self.marks)
 
     def mounted(self, flange: FloatArray, points: FloatArray) -> FloatArray:
         """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
         if self.mount == "fixed":
             return points
-        R_BF = flange[..., None, :3, :3]
-        p_BF = flange[..., None, :3, 3]
-        return np.vecmat(points - p_BF, R_BF)
+        return into_frame(flange[..., None, :, :], points)
 
     def in_cameras(self, points: FloatArray) -> FloatArray:
         """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
-        cameras = self.poses[..., None, :, :]
-        from_camera = points[..., None, :, :] - cameras[..., :3, 3]
-        return np.vecmat(from_camera, cameras[..., :3, :3])
+        return into_frame(self.poses[..., None, :, :], points[..., None, :, :])
 
     def with_lens(self, deviation: FloatArray) -> Self:
         """Return this model with deviating intrinsics, 1 + focal, centre [px] and distortion, (4,), if it has any."""
@@ -283,14 +283,11 @@ class HandEyeModel(RobotModel):
 
     def to_camera(self, p_B: npt.ArrayLike) -> FloatArray:
         """Return points of the base frame in the camera frame, (..., 3) m."""
-        p = np.asarray(p_B, dtype=np.float64)
-        from_camera = p - self.X_BC[..., :3, 3]
-        return np.vecmat(from_camera, self.X_BC[..., :3, :3])
+        return into_frame(self.X_BC, np.asarray(p_B, dtype=np.float64))
 
     def to_base(self, p_C: npt.ArrayLike) -> FloatArray:
         """Return points of the camera frame in the base frame, (..., 3) m."""
-        p = np.asarray(p_C, dtype=np.float64)
-        return np.matvec(self.X_BC[..., :3, :3], p) + self.X_BC[..., :3, 3]
+        return from_frame(self.X_BC, np.asarray(p_C, dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)

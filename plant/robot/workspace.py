@@ -20,7 +20,14 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray, IntArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
-from servobench.plant.robot.arm import JointLimits, Links, SerialArm, freeze_arrays
+from servobench.plant.robot.arm import (
+    JointLimits,
+    Links,
+    SerialArm,
+    freeze_arrays,
+    from_frame,
+    into_frame,
+)
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
@@ -119,8 +126,7 @@ class Tubes:
 
     def placed(self, frames: FloatArray) -> FloatArray:
         """Return both ends of each tube in the base frame, (..., s, 2, 3) m, for frames (..., n+1, 4, 4)."""
-        own = frames[..., self.link, None, :, :]
-        return np.matvec(own[..., :3, :3], self.ends) + own[..., :3, 3]
+        return from_frame(frames[..., self.link, None, :, :], self.ends)
 
 
 def link_tubes(arm: SerialArm, links: Links) -> Tubes:
@@ -197,16 +203,15 @@ class Clearance:
 
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
-        R_BC = self.X_BC[:3, :3]
-        p_BC = self.X_BC[:3, 3]
-        p_C = np.vecmat(ball - p_BC, R_BC)
+        p_C = into_frame(self.X_BC, ball)
         size = np.array([self.camera.width, self.camera.height])
         # Half sides of the image over the distance from the camera
         half = IMAGE_SHARE * size / (2.0 * self.camera.focal)
         across = np.abs(p_C[..., :2])
         depth = p_C[..., 2]
         inside = (across <= half * p_C[..., 2:]).all(axis=-1) & (depth > 0.0)
-        ray = np.stack([ball, np.broadcast_to(p_BC, ball.shape)], axis=-2)
+        p_BC = np.broadcast_to(self.X_BC[:3, 3], ball.shape)
+        ray = np.stack([ball, p_BC], axis=-2)
         free = segment_distance(placed, ray[..., None, :, :]) - self.tubes.radius
         return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
 
