@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Self
 
 from servobench.plant.contract.checksums import SUMS
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, one_line
 from servobench.plant.contract.files import PARTIAL, accessing, harmless
 
 LOCK = ".lock"
@@ -55,7 +55,7 @@ class Holder:
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
             texts = (str(content[key])[:200] for key in ("owner", "host", "begun", "started"))
-            owner, host, begun, started = (" ".join(text.split()) for text in texts)
+            owner, host, begun, started = map(one_line, texts)
             return cls(owner, host, int(content["pid"]), begun, started)
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None

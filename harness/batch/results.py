@@ -28,7 +28,7 @@ from servobench.harness.batch.tables import (
     writing,
 )
 from servobench.plant.contract.checksums import SUMS, Sums, append_sums, digest, fault
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, one_line
 from servobench.plant.contract.files import PARTIAL
 
 Manifest: TypeAlias = schema.Manifest
@@ -180,7 +180,7 @@ class ResultsFolder:
             try:
                 table = self._read_other(path)
             except (OSError, ValueError, OverflowError) as error:
-                why = " ".join(str(error).split())
+                why = one_line(error)
                 if isinstance(error, DamagedFile):
                     why = error.fault
                 raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error

@@ -20,7 +20,7 @@ from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import SHORT_NAMES, Row
 from servobench.plant.contract.checks import AnyArray
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, one_line
 
 ROW_GROUP = 2048  # [rows] of a table that are in memory at a time while parts are put together
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
@@ -246,7 +246,7 @@ def reading(folder: Path, name: str) -> Iterator[None]:
     except ConfigurationError:
         raise
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        why = " ".join(str(error).split()) or type(error).__name__
+        why = one_line(error) or type(error).__name__
         if NO_THREAD in why:
             raise ConfigurationError(
                 f"{folder / name} cannot be read, as no more threads or processes may be started here: ulimit -u"

@@ -17,7 +17,7 @@ from rich.markup import escape
 from servobench.harness.cli.applications import HELP_NAMES, assemble
 from servobench.harness.cli.options import ABSENT
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED, ending_alike
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, one_line
 from servobench.plant.contract.files import harmless
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE,
@@ -181,7 +181,7 @@ def _usage_line(error: typer.TyperException) -> str:
     if context and option and (key := short_key(option)):
         return f"{context.info_name} has no {option}: it is a setting, --set {key}=...; sweep varies it by {option}"
     help_ = f"; see {context.command_path} --help" if context else ""
-    words = " ".join(error.format_message().split())
+    words = one_line(error.format_message())
     if words:
         return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}"
     return ""

@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Self, TypeAlias
 
 from servobench.plant.contract.checksums import digest
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, one_line
 from servobench.plant.contract.files import is_file, reason, user_path
 from servobench.plant.contract.settings import suggest
 
@@ -188,7 +188,7 @@ def describe_at(error: BaseException) -> str:
             _first_place((frame.filename, frame.lineno) for frame in frames),
             str(error),
         )
-    return place + " ".join(f"{type(error).__name__}: {message}".split()).rstrip(":")
+    return place + one_line(f"{type(error).__name__}: {message}").rstrip(":")
 
 
 def place_in_trace(trace: str) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servobench.harness.config.source import PACKAGE_FOLDER, is_users
 from servobench.harness.run.variations import Row
-from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault, one_line
 from servobench.plant.contract.files import harmless
 
 if TYPE_CHECKING:
@@ -195,6 +195,6 @@ def _trace(error: BaseException) -> str:
 
 def _one_line(error: BaseException) -> str:
     try:
-        return " ".join(str(error).split())
+        return one_line(error)
     except BaseException as second:  # noqa: BLE001 - code of users
         return f"its text cannot be had, which raises {type(second).__name__}"

@@ -61,12 +61,17 @@ class SolverFailed(RunFault, status="solver_failed"):
     """An optimiser returned no usable answer and no fallback was configured."""
 
 
+def one_line(words: object) -> str:
+    """Return an error's message, or other words, as one line without blanks at its ends."""
+    return " ".join(str(words).split())
+
+
 class ConfigurationError(ValueError):
     """A setting or name that cannot be used; the message is one line for the user, also for a text of several."""
 
     def __init__(self, message: str) -> None:
         """Keep the message without line ends and without characters that would control a terminal."""
-        words = " ".join(message.split())
+        words = one_line(message)
         if len(words) > MAX_LENGTH:
             half = MAX_LENGTH // 2
             words = f"{words[:half]} ... {words[-half:]}"

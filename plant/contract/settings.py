@@ -53,6 +53,7 @@ from pydantic.dataclasses import dataclass, rebuild_dataclass
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
 from servobench.plant.contract.checks import AnyArray, FloatArray
+from servobench.plant.contract.faults import one_line
 from servobench.plant.contract.units import (
     EXTENT,
     alternatives,
@@ -367,7 +368,7 @@ def strings_in(definition: ast.stmt) -> dict[str, str]:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
                 value=ast.Constant(value=str(text))
             ):
-                strings[name] = " ".join(text.split())
+                strings[name] = one_line(text)
     return strings
 
 
@@ -526,7 +527,7 @@ def describe(
     context = first.get("ctx", {})
     came = native(first["input"])
     if kind == "value_error":
-        return " ".join(str(context["error"]).split())
+        return one_line(context["error"])
     if kind in _BOUNDS:
         key, word, within = _BOUNDS[kind]
         bound = context[key]

@@ -17,6 +17,7 @@ from textwrap import shorten
 from typing import Any, Self
 
 from servobench.plant.contract.checks import Shape
+from servobench.plant.contract.faults import one_line
 from servobench.plant.contract.settings import suggest
 from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.archive import DESCRIPTION
@@ -288,7 +289,7 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
 
 def _line(words: object) -> str:
     """Return text of a foreign file as one line of limited length."""
-    return shorten(" ".join(str(words).split()) or type(words).__name__, 300, placeholder=" ...")
+    return shorten(one_line(words) or type(words).__name__, 300, placeholder=" ...")
 
 
 def _unit(variable: Any, units: Mapping[str, Any]) -> str:  # noqa: ANN401 - as above

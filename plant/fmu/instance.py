@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from servobench.plant.contract.checks import AnyArray, FloatArray, Shape
-from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.faults import FmuError, one_line
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
 from servobench.plant.fmu.dialect import FmiDialect
 from servobench.plant.fmu.library import Library, MessageLog
@@ -449,9 +449,8 @@ class Integrator:
             event, _, reached = self._solver.step(time, until)
         except RuntimeError as error:
             self._raise_fault()
-            words = " ".join(str(error).split())
             raise FmuError(
-                f"{self._instance.description.path.name} cannot be integrated: {words}"
+                f"{self._instance.description.path.name} cannot be integrated: {one_line(error)}"
             ) from error
         self._raise_fault()
         return bool(event), float(reached)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.plant.contract.cache import EXTRACTED, UNFINISHED, cache_folder, forbids_code
-from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.faults import FmuError, one_line
 from servobench.plant.contract.files import accessing
 from servobench.plant.fmu.description import FmuDescription
 
@@ -152,7 +152,7 @@ class MessageLog:
     def add(self, status: int, message: bytes | None) -> None:
         """Take a message of C with its status."""
         words = (message or b"").decode("utf-8", errors="replace")
-        text = " ".join(words.split())
+        text = one_line(words)
         self._last.append(text)
         level = STATUS_LEVELS[status] if 0 <= status < len(STATUS_LEVELS) else logging.ERROR
         logger.log(level, "%s: %s", self._name, text)

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import one_line
 from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
 from servobench.plant.rendered.engine import (
@@ -97,7 +98,7 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
         with context.as_current():
             return context
     except Exception as error:  # a missing part shows in many ways, by library and by driver
-        why = " ".join(str(error).split())
+        why = one_line(error)
         raise ValueError(
             f"MuJoCo cannot render through {name} ({type(error).__name__}: {why}): {INSTALL}"
         ) from error

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from servobench.plant.contract.facts import read_facts
+from servobench.plant.contract.faults import one_line
 from servobench.plant.contract.files import read_text, yaml_loader
 from servobench.plant.contract.settings import remark
 
@@ -109,8 +110,7 @@ def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
         # `ros2 topic echo` puts --- after each message.
         return next(documents, None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        cause = " ".join(str(error).split())
-        raise ValueError(f"{path.name} is not valid YAML: {cause}") from error
+        raise ValueError(f"{path.name} is not valid YAML: {one_line(error)}") from error
 
 
 def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import one_line
 from servobench.plant.contract.files import read_text, user_path, yaml_loader
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, Links, SerialArm, arm_from_dh, plain_arm
@@ -182,8 +183,7 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
         numbers = [[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS]
         table = np.array(numbers)
     except yaml.YAMLError as error:
-        cause = " ".join(str(error).split())
-        raise ValueError(f"calibration file {path} is not valid YAML: {cause}") from error
+        raise ValueError(f"calibration file {path} is not valid YAML: {one_line(error)}") from error
     except KeyError as error:
         raise ValueError(
             f"calibration file {path} lacks {error}; wanted 'kinematics' with {wanted}"

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from xml.etree import ElementTree as ET
 
 from servobench.plant.contract.facts import read_facts
-from servobench.plant.contract.faults import configuration_errors
+from servobench.plant.contract.faults import configuration_errors, one_line
 from servobench.plant.contract.files import accessing
 from servobench.plant.contract.settings import listed, remark, suggest
 from servobench.plant.robot.arm import rpy_from_rotation
@@ -116,10 +116,10 @@ def _parse(content: bytes) -> Element:
     try:
         root = etree.fromstring(content or b" ", parser)
     except etree.XMLSyntaxError as error:
-        raise ValueError(" ".join(str(error).split())) from error
+        raise ValueError(one_line(error)) from error
     for fault in parser.error_log:
         if fault.type_name not in TOLERATED:
-            message = " ".join(fault.message.split())
+            message = one_line(fault.message)
             raise ValueError(f"{message}, line {fault.line}, column {fault.column}")
     if _tag(root) != "robot":
         raise ValueError(f"its root is <{_tag(root)}>, and that of a URDF is <robot>")

@@ -16,7 +16,7 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.faults import FmuError, one_line
 from servobench.plant.fmu.archive import DESCRIPTION, extract_fmu
 from servobench.plant.fmu.description import (
     IDENTIFIER,
@@ -106,7 +106,7 @@ def validate_fmu(path: Path) -> Validation:
     """
     root = extract_fmu(path)
     description = read_description(path, root)
-    departures = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
+    departures = list(map(one_line, validate_by_fmpy(str(path))))
     problems = [*_odd_times(root), *_odd_names(root)]
     deviation = None
     referenced = (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file()
