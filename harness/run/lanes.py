@@ -32,6 +32,7 @@ class Ends:
     """Which runs are still under way, and how the others ended.
 
     Attributes:
+        all: indices of all runs.
         running: indices of the runs that are under way, ascending.
         faults: the error that ended a run, by its index.
         rows: rows of the log that such a run has.
@@ -39,8 +40,8 @@ class Ends:
 
     def __init__(self, count: int) -> None:
         """Start `count` runs."""
-        self.count = count
-        self.running = np.arange(count)
+        self.all = np.arange(count)
+        self.running = self.all
         self.faults: dict[int, Exception] = {}
         self.rows: dict[int, int] = {}
 
@@ -57,11 +58,11 @@ class Ends:
         if not len(self.running):
             raise AllEnded
 
-    def left_of(self, lanes: IntArray) -> IntArray | None:
-        """Return the places of the runs that are still under way among those that were, or None if all are."""
+    def left_of(self, tree: Tree, lanes: IntArray) -> Tree:
+        """Return of arrays with a place for each of some `lanes` those of the runs that are still under way."""
         if len(lanes) == len(self.running):
-            return None
-        return np.flatnonzero(np.isin(lanes, self.running))
+            return tree
+        return take(tree, np.flatnonzero(np.isin(lanes, self.running)))
 
     def spread(self, tree: Tree, before: Tree) -> Tree:
         """Return arrays of the runs under way in their places among all runs; the others keep those from before."""
@@ -71,7 +72,7 @@ class Ends:
             spread[self.running] = values
             return spread
 
-        if len(self.running) == self.count:
+        if len(self.running) == len(self.all):
             return tree
         return map_arrays(placed, tree, before)
 
@@ -97,17 +98,13 @@ class ManyBenches(Plant):
     def step(self, command: Command) -> Observation:
         """See `Plant.step`; a run whose plant fails ends."""
         self._leave()
-        if len(self._ends.running) < self._ends.count:
-            command = take(command, self._ends.running)
-        observation = self._bench.step(command)
+        observation = self._bench.step(self._ends.left_of(command, self._ends.all))
         lanes = self._ends.running
         for lane, fault in self._bench.faults.items():
             self._ends.end(int(lanes[lane]), fault, self._k)
-        stay = self._leave()
-        if stay is not None:
-            observation = take(observation, stay)
+        self._leave()
         self._k += 1
-        self._last = self._ends.spread(observation, self._last)
+        self._last = self._ends.spread(self._ends.left_of(observation, lanes), self._last)
         return self._last
 
     def truth(self) -> Truth:
@@ -125,13 +122,12 @@ class ManyBenches(Plant):
         """See `Plant.close`."""
         self._bench.close()
 
-    def _leave(self) -> IntArray | None:
-        """Let runs that ended leave the bench; return which of its lanes stay, or None if all do."""
-        stay = self._ends.left_of(self._mine)
-        self._mine = self._ends.running
-        if stay is not None:
+    def _leave(self) -> None:
+        """Let runs that ended leave the bench."""
+        stay = self._ends.left_of(np.arange(len(self._mine)), self._mine)
+        if len(stay) < len(self._mine):
             self._bench.keep(stay)
-        return stay
+        self._mine = self._ends.running
 
 
 @final
@@ -157,11 +153,9 @@ class ManyServos(Controller):
         Raises:
             Exception: a step failed, and repeated with fewer lanes it does not.
         """
-        given = (observation, reference)
+        given = self._ends.left_of((observation, reference), self._ends.all)
         lanes = self._ends.running
         self._leave()
-        if len(lanes) < self._ends.count:
-            given = take(given, lanes)
         try:
             self._state, u = self._servo.step(self._state, *given)
         except Exception:
@@ -173,21 +167,16 @@ class ManyServos(Controller):
             return self.step(observation, reference)
         for lane, fault in self._servo.faults.items():
             self._ends.end(int(lanes[lane]), fault, self._k)
-        stay = self._leave()
-        if stay is not None:
-            u = take(u, stay)
+        self._leave()
         self._k += 1
-        self._u = self._ends.spread(u, self._u)
+        self._u = self._ends.spread(self._ends.left_of(u, lanes), self._u)
         self._jacobian = self._ends.spread(self._servo.jacobian(self._state), self._jacobian)
         return Command(self._u)
 
-    def _leave(self) -> IntArray | None:
-        """Let runs that ended leave the state; return which of its lanes stay, or None if all do."""
-        stay = self._ends.left_of(self._mine)
+    def _leave(self) -> None:
+        """Let runs that ended leave the state."""
+        self._state = self._ends.left_of(self._state, self._mine)
         self._mine = self._ends.running
-        if stay is not None:
-            self._state = take(self._state, stay)
-        return stay
 
     def estimated_jacobian(self) -> FloatArray:
         """See `Controller.estimated_jacobian`."""
@@ -232,7 +221,7 @@ class ManyLogs(StepLog):
 
     def __init__(self, spec: PlantSpec, periods: int, ends: Ends) -> None:
         """Prepare an empty log with a lane for each run."""
-        super().__init__(spec, periods, (ends.count,))
+        super().__init__(spec, periods, (len(ends.all),))
         self._ends = ends
 
     def end(self, lanes: BoolArray, fault: Exception) -> None:
