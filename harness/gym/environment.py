@@ -472,24 +472,22 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
         """
         check_options(options)
         count = self.num_envs
-        listed: list[int | None] | None = None
+        first: Any = seed
+        given: list[int | None] = [None] * count
         if isinstance(seed, list | tuple | np.ndarray):
-            listed = [None if each is None else read_seed(each) for each in seed]
-        if listed is not None and len(listed) != count:
-            raise ConfigurationError(
-                f"seed must be a number or a list of {count}, got {len(listed)} seeds"
-            )
-        first = cast("int | None", seed if listed is None else listed[0])
+            given = [None if each is None else read_seed(each) for each in seed]
+            if len(given) != count:
+                raise ConfigurationError(
+                    f"seed must be a number or a list of {count}, got {len(given)} seeds"
+                )
+            first = given[0]
         super().reset(seed=first)
-        if listed is None and first is not None and read_seed(first) > 2**63 - count:
-            raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {first}")
-        seeds = (
-            self.np_random.integers(SEEDS, size=count)
-            if first is None or listed
-            else first + np.arange(count)
-        )
-        if listed is not None:
-            pairs = zip(listed, seeds.tolist(), strict=True)
+        if isinstance(seed, int):
+            if read_seed(seed) > 2**63 - count:
+                raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {seed}")
+            seeds = seed + np.arange(count)
+        else:
+            pairs = zip(given, self.np_random.integers(SEEDS, size=count).tolist(), strict=True)
             seeds = np.array([drawn if each is None else each for each, drawn in pairs])
         self.close_extras()
         self._many = many = build_together(
