@@ -72,16 +72,12 @@ class Spaces:
         if stamps:
             lower = np.append(lower, [-LATENESS_BOUND, 0.0])
             upper = np.append(upper, [LATENESS_BOUND, 1.0])
-        self._lower, self._upper = lower.astype(np.float32), upper.astype(np.float32)
-        self.observations = Box(self._lower, self._upper, dtype=np.float32)
-        self.actions = Box(-1.0, 1.0, (spec.n,), np.float32)
+        self.observations = Box(lower.astype(np.float32), upper.astype(np.float32))
+        self.actions = Box(-1.0, 1.0, (spec.n,))
 
-    def command(self, action: npt.ArrayLike) -> FloatArray:
+    def command(self, action: FloatArray) -> FloatArray:
         """Return joint velocities, (..., n) rad/s, for an action, (..., n) shares of the limits; clipped to them."""
-        return (
-            np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
-            * self.spec.joint_velocity_limit
-        )
+        return action.clip(-1.0, 1.0) * self.spec.joint_velocity_limit
 
     def action(self, given: npt.ArrayLike, *lanes: int) -> FloatArray:
         """Return an action as an array, (*lanes, n).
@@ -102,7 +98,7 @@ class Spaces:
         self._first_age = observation.time - observation.capture_time
 
     def observe(
-        self, observation: Observation, reference: FloatArray, action: npt.ArrayLike
+        self, observation: Observation, reference: FloatArray, action: FloatArray
     ) -> Floats32:
         """Return the policy's observation.
 
@@ -116,15 +112,20 @@ class Spaces:
         """
         scale, feature = self.spec.feature.scale, observation.feature
         errors = (reference - feature[..., None, :]) / scale
-        action = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
-        parts = observation.joint_position, feature / scale, errors.reshape(*feature.shape[:-1], -1)
-        whole = np.concatenate([*parts, observation.valid.astype(np.float64), action], axis=-1)
+        parts = (
+            observation.joint_position,
+            feature / scale,
+            errors.reshape(*observation.lead, -1),
+            observation.valid,
+            action.clip(-1.0, 1.0),
+        )
+        whole = np.concatenate(parts, axis=-1)
         if self._stamps:
             lateness = observation.time - observation.capture_time - self._first_age
             known = np.isfinite(lateness)
             stamp = np.stack([np.where(known, lateness, 0.0), known], axis=-1)
             whole = np.concatenate([whole, stamp], axis=-1)
-        return np.clip(whole.astype(np.float32), self._lower, self._upper)
+        return np.clip(whole.astype(np.float32), self.observations.low, self.observations.high)
 
     def error(self, truth: Truth, desired: FloatArray) -> FloatArray:
         """Return the norm of the true feature's error, (...), in natural sizes of a feature."""
@@ -263,12 +264,12 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         try:
             observation = experiment.plant.reset(named_seed(run_seed, "plant"))
         except RunFault as fault:
-            spec, start = self._spaces.spec, experiment.scenario.start
-            start = np.zeros(spec.n) if start is None else start
-            observation, self._fault = (
-                Observation(0.0, start, np.zeros(spec.m), feature_valid=False),
-                fault,
-            )
+            spec = self._spaces.spec
+            start = experiment.scenario.start
+            if start is None:
+                start = np.zeros(spec.n)
+            observation = Observation(0.0, start, np.zeros(spec.m), feature_valid=False)
+            self._fault = fault
             info["reason"] = str(fault)
         self._rollout = Rollout(experiment.plant, observation, desired, experiment.loop)
         self._spaces.begin(observation)
