@@ -142,15 +142,18 @@ def call(function: Work, argument: object, limits: Limits, hear: Tell) -> Ending
 class Pool:
     """Isolated processes, which start with the first tasks, and the threads that talk to them."""
 
-    def __init__(self, count: int, limits: Limits, modules: Sequence[str]) -> None:
+    def __init__(
+        self, count: int, limits: Limits, modules: Sequence[str], *, copied: bool = False
+    ) -> None:
         """Prepare isolated processes.
 
         Args:
             count: number of isolated processes.
             limits: of each run.
             modules: imported once by each guard.
+            copied: whether the guards are copies of this process.
         """
-        self._limits, self._modules = limits, modules
+        self._limits, self._modules, self._copied = limits, modules, copied
         self._threads = ThreadPoolExecutor(count)
         self._own = threading.local()
         self._isolated: list[IsolatedProcess] = []
@@ -159,8 +162,8 @@ class Pool:
         """Carry a task out; `hear` receives the answers instead of the future, in another thread."""
         return self._threads.submit(self._carry_out, task, hear)
 
-    def stop(self) -> None:
-        """End everything; a task that was not carried out has no answer."""
+    def stop(self, patience: float = STOP_TIME) -> None:
+        """End everything, within a time [s]; a task that was not carried out has no answer."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         for isolated in self._isolated:
             isolated.ask_to_end()
@@ -169,7 +172,7 @@ class Pool:
 
     def _carry_out(self, task: Task, hear: Tell | None) -> Answer:
         if not hasattr(self._own, "isolated"):
-            self._own.isolated = IsolatedProcess(self._limits, self._modules)
+            self._own.isolated = IsolatedProcess(self._limits, self._modules, copied=self._copied)
             self._isolated.append(self._own.isolated)
         return self._own.isolated.carry_out(task, hear)
 

@@ -27,9 +27,9 @@ from servobench.harness.apps.figures import style
 from servobench.harness.apps.figures.figures import (
     KINDS,
     Choice,
+    Order,
     draw_figures,
     folder_figures,
-    page_figures,
 )
 from servobench.harness.apps.figures.measures import draw_conditions
 from servobench.harness.apps.figures.style import (
@@ -45,7 +45,7 @@ from servobench.harness.apps.figures.style import (
 )
 from servobench.harness.apps.figures.tracks import Track, load_groups
 from servobench.harness.apps.report.page import path_views
-from servobench.harness.batch import results
+from servobench.harness.batch import results, shares
 from servobench.harness.batch.results import ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.plant.contract.checksums import write_vouched
@@ -55,6 +55,10 @@ OTHERS = [f"method_{i}" for i in range(20)]
 
 def kinds(folder):
     return [named.kind for named in folder_figures(ResultsFolder(folder))]
+
+
+def drawn(folder):
+    return draw_figures(Order(ResultsFolder(folder), folder / "figures"))
 
 
 def legend_of(figure) -> list[str]:
@@ -133,11 +137,9 @@ def test_more_than_four_moves_go_into_several_figures(tmp_path):
 def test_a_page_has_each_task_apart_for_a_screen_and_for_a_phone_and_nothing_is_cut(tmp_path):
     names = ("ukf_mfac", "./a_folder/my_own_controller.py:MyVeryOwnController", *OTHERS[:9])
     folder = comparison(tmp_path / "out", names, ("exp1", "exp2"))
-    figures = list(
-        page_figures(
-            ResultsFolder(folder), results.load_runs(folder), ("errors", "paths", "settling")
-        )
-    )
+    choice = Choice(("errors", "paths", "settling"), layouts=(WIDE, NARROW), title=False)
+    drawn = folder_figures(ResultsFolder(folder), choice)
+    figures = list(zip(drawn, drawn, strict=True))
     assert [wide.tasks for wide, _ in figures if wide.kind == "errors"] == [("exp1",), ("exp2",)]
     assert all(wide.tasks == narrow.tasks and len(wide.tasks) == 1 for wide, narrow in figures)
     for wide, narrow in (pair for pair in figures if pair[0].tasks == ("exp1",)):
@@ -162,13 +164,15 @@ def test_a_long_name_is_broken_where_it_can_be():
     assert fitted("x" * 25, 10).splitlines() == ["x" * 10, "x" * 10, "x" * 5]
 
 
-def test_figures_of_a_run_are_pictures_and_the_same_each_time(tmp_path):
+def test_figures_of_a_run_are_the_same_pictures_by_one_process_and_by_copies(tmp_path, monkeypatch):
+    monkeypatch.setattr(shares, "available_processors", lambda: 3)
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
-    paths = draw_figures(ResultsFolder(folder))
+    paths = drawn(folder)
     assert {path.suffix for path in paths} == {".png"}
     assert len(paths) == 5
     before = {path.name: path.read_bytes() for path in paths}
-    assert before == {path.name: path.read_bytes() for path in draw_figures(ResultsFolder(folder))}
+    monkeypatch.setattr(shares, "available_processors", lambda: 1)
+    assert before == {path.name: path.read_bytes() for path in drawn(folder)}
 
 
 def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
@@ -286,7 +290,7 @@ def test_an_overview_keeps_the_root_mean_square_error_and_a_closing_the_last_row
 
 @pytest.mark.parametrize(("folder", "wanted"), [(sweep, ["conditions.png"]), (failed_only, [])])
 def test_a_folder_without_steps_has_no_figures_of_them(tmp_path, folder, wanted):
-    assert [path.name for path in draw_figures(ResultsFolder(folder(tmp_path / "out")))] == wanted
+    assert [path.name for path in drawn(folder(tmp_path / "out"))] == wanted
     assert (tmp_path / "out" / "figures").exists() == bool(wanted)
 
 
@@ -375,7 +379,9 @@ def test_every_figure_of_the_report_fits_a_column_of_a_paper(monkeypatch, tmp_pa
 @pytest.mark.parametrize("width", [252.0, 516.0])
 def test_a_figure_is_as_wide_as_a_column_of_ieeetran_or_both(tmp_path, width):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
-    choice = Choice(("errors",), {"ukf_mfac": "Mine"}, Layout.of_width(f"{width:g}pt"), title=False)
+    choice = Choice(
+        ("errors",), {"ukf_mfac": "Mine"}, (Layout.of_width(f"{width:g}pt"),), title=False
+    )
     (named,) = folder_figures(ResultsFolder(folder), choice)
     (path,) = style.save_figure(named.figure, tmp_path / "errors", ("pdf",), exact_width=True)
     points = float(re.search(rb"/MediaBox \[ ?0 0 (\S+) ", path.read_bytes())[1])
@@ -385,7 +391,10 @@ def test_a_figure_is_as_wide_as_a_column_of_ieeetran_or_both(tmp_path, width):
 def test_figures_show_the_chosen_controllers_by_their_new_names_in_their_usual_style(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "mine", "rls"))
     choice = Choice(
-        ("errors",), {"rls": "UKF+MFAC", "ukf_mfac": "Mine"}, Layout.of_width("89mm"), title=False
+        ("errors",),
+        {"rls": "UKF+MFAC", "ukf_mfac": "Mine"},
+        (Layout.of_width("89mm"),),
+        title=False,
     )
     figures = list(folder_figures(ResultsFolder(folder), choice))
     assert [named.tasks for named in figures] == [("exp1",), ("exp2",)]

@@ -16,10 +16,11 @@ import pytest
 from kit.command import left_behind, python, start, wait_for
 from kit.forked import say_modules
 from kit.nightly import some
-from servobench.harness.batch import isolation
+from servobench.harness.batch import isolation, shares
 from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.isolation import Pool, Task
 from servobench.harness.batch.processes import Bounds, Limits
+from servobench.harness.batch.shares import in_shares
 from servobench.plant.contract.faults import ConfigurationError
 
 
@@ -301,3 +302,42 @@ def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
 def test_pandas_is_imported_once_and_beyond_the_memory_limit_where_foreign_code_runs(name, wanted):
     with open_workers(2, bounds=Bounds(run_memory=150e6), controllers=[name]) as workers:
         assert workers.submit(Task(say_modules, pickle.dumps(None))).result().items == [wanted]
+
+
+def squared(argument, share):
+    """Yield squares by copies of this process, of which those of `ending` end and the others refuse 7."""
+    count, own, ending = argument
+    for number, piece in share.of(range(count)):
+        if os.getpid() != own and piece in ending:
+            os._exit(3)
+        if piece == 7:
+            raise ConfigurationError("7 is refused")
+        yield number, piece**2, os.getpid()
+
+
+@pytest.mark.parametrize(
+    ("count", "processors", "ending"),
+    [(5, 3, ()), (2, 3, ()), (0, 2, ()), (5, 2, (4,)), (5, 1, (0,))],
+)
+def test_a_work_in_shares_has_the_answers_of_one_process_in_its_order(
+    count, processors, ending, monkeypatch
+):
+    monkeypatch.setattr(shares, "available_processors", lambda: processors)
+    answers = in_shares(squared, (count, os.getpid(), ending))
+    assert [tuple(each[:2]) for each in answers] == [(i, i**2) for i in range(count)]
+    alone = processors == 1 or bool(ending)
+    assert {each[2] for each in answers} & {os.getpid()} == ({os.getpid()} if alone else set())
+    assert len({each[2] for each in answers}) == (1 if alone else min(count, processors))
+    assert not multiprocessing.active_children()
+
+
+def test_an_error_of_a_share_is_raised_in_this_process(monkeypatch):
+    monkeypatch.setattr(shares, "available_processors", lambda: 2)
+    with pytest.raises(ConfigurationError, match="^7 is refused$"):
+        in_shares(squared, (9, os.getpid(), ()))
+
+
+def test_a_daemonic_process_does_a_work_in_shares_alone(monkeypatch):
+    monkeypatch.setattr(shares, "available_processors", lambda: 2)
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
+    assert [each[2] for each in in_shares(squared, (3, os.getpid(), ()))] == [os.getpid()] * 3

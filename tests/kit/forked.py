@@ -43,7 +43,9 @@ def _call(blocked, arguments, folder, streams, environment) -> None:
     assert not sys.modules.keys() & set(blocked)
     sys.modules.update(dict.fromkeys(blocked))
     if arguments[0] == "run":  # whose figures take seconds
-        figures = SimpleNamespace(draw_figures=lambda _: [], page_figures=None, KINDS={})
+        names = ("Choice", "KINDS", "Order", "folder_figures", "draw_figures", "FOLDER")
+        figures = SimpleNamespace(**dict.fromkeys(names, lambda *_: []))
+        figures.FOLDER = "figures"
         sys.modules["servobench.harness.apps.figures.figures"] = figures
     sys.argv = ["servobench", *arguments]
     from servobench.harness.cli.main import main

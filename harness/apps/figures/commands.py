@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 def draw(opened: ResultsFolder) -> list[Path]:
     """Draw the figures of a folder into it and return their files."""
-    from servobench.harness.apps.figures.figures import draw_figures
+    from servobench.harness.apps.figures.figures import FOLDER, Order, draw_figures
 
-    return draw_figures(opened)
+    return draw_figures(Order(opened, opened.path / FOLDER))
 
 
 def figures(
@@ -59,8 +59,8 @@ def figures(
 
     They are those of the report, with chosen kinds, controllers, names and width; nothing is simulated for them.
     """
-    from servobench.harness.apps.figures.figures import FOLDER, KINDS, Choice, folder_figures
-    from servobench.harness.apps.figures.style import ALL_FORMATS, Layout, check_tex, save_figure
+    from servobench.harness.apps.figures.figures import FOLDER, KINDS, Choice, Order, draw_figures
+    from servobench.harness.apps.figures.style import ALL_FORMATS, Layout, check_tex
     from servobench.harness.batch.results import ResultsFolder
 
     formats = selection.split_names("format", format_, ALL_FORMATS)
@@ -75,17 +75,15 @@ def figures(
     if "pgf" in formats:
         check_tex()
     say(opened.describe_missing())
-    choice = Choice(kinds, labels, Layout.of_width(width), title)
+    choice = Choice(kinds, labels, (Layout.of_width(width),), title)
     target = out or folder / FOLDER
-    files = []
     with (
         console.status("drawing the figures"),
         accessing(target),
         writing_together(target) as partial,
     ):
-        for named in folder_figures(opened, choice):
-            made = save_figure(named.figure, partial / named.stem, formats, exact_width=True)
-            files += [target / path.name for path in made]
+        made = draw_figures(Order(opened, partial, choice, formats, exact_width=True))
+    files = [target / path.name for path in made]
     if not files:
         opened.check_steps()
         raise ConfigurationError(

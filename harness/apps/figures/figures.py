@@ -1,7 +1,7 @@
 """All figures of a results folder, from its tables alone."""
 
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,6 @@ from servobench.harness.apps.figures.responses import (
     draw_tracking,
 )
 from servobench.harness.apps.figures.style import (
-    NARROW,
     TEXT,
     WIDE,
     Layout,
@@ -45,6 +44,7 @@ from servobench.harness.apps.figures.tracks import (
     shown_until,
 )
 from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.shares import WHOLE, Share, in_shares
 from servobench.harness.run.request import UNFIT_FOR_FILES
 from servobench.plant.contract.facts import read_beside
 
@@ -74,6 +74,7 @@ class NamedFigure(NamedTuple):
     title: str  # the heading, and the place and seeds of its runs
     tasks: tuple[str, ...]  # the tasks that it shows; empty if it shows all
     figure: Figure
+    number: int  # its place among the figures of a folder
 
 
 @dataclass(frozen=True)
@@ -83,24 +84,43 @@ class Choice:
     kinds: Collection[str] = tuple(KINDS)  # some of KINDS
     # Controllers that are shown, with their names in the figures; None for all.
     names: Mapping[str, str] | None = None
-    layout: Layout = WIDE  # layout of the figures; a narrow one shows tasks one by one
+    # Layouts of each figure; with a narrow one they show tasks one by one.
+    layouts: tuple[Layout, ...] = (WIDE,)
     title: bool = True  # whether the figures have titles
 
 
-def draw_figures(folder: ResultsFolder) -> list[Path]:
-    """Draw the runs of each plant and mismatch into the folder's `figures`; return the files, PNG.
+class Order(NamedTuple):
+    """Figures that files are to hold."""
+
+    folder: ResultsFolder
+    target: Path  # folder of the files
+    choice: Choice = Choice()
+    formats: Sequence[str] = ("png",)
+    exact_width: bool = False  # as for `save_figure`
+
+
+def draw_figures(order: Order) -> list[Path]:
+    """Draw figures into files, several at a time, and return the files.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    paths = []
-    for named in folder_figures(folder):
-        paths += save_figure(named.figure, folder.path / FOLDER / named.stem, ("png",))
-    return paths
+    drawn = in_shares(_draw_share, order)
+    return [order.target / name for _, names in drawn for name in names]
 
 
-def folder_figures(folder: ResultsFolder, choice: Choice = Choice()) -> Iterator[NamedFigure]:
-    """Yield the chosen figures of a results folder, one in memory at a time.
+def _draw_share(order: Order, share: Share) -> Iterator[tuple[int, list[str]]]:
+    """Draw a share of the figures; yield the number of each and the names of its files."""
+    for named in folder_figures(order.folder, order.choice, share):
+        stem = order.target / named.stem
+        made = save_figure(named.figure, stem, order.formats, exact_width=order.exact_width)
+        yield named.number, [path.name for path in made]
+
+
+def folder_figures(
+    folder: ResultsFolder, choice: Choice = Choice(), share: Share = WHOLE
+) -> Iterator[NamedFigure]:
+    """Yield the chosen figures of a results folder, one in memory at a time; a figure in all layouts before the next.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -111,30 +131,13 @@ def folder_figures(folder: ResultsFolder, choice: Choice = Choice()) -> Iterator
         runs = runs[runs["controller"].isin(list(choice.names))]
         runs = runs.assign(controller=runs["controller"].map(choice.names))
         styles = {shown: styles[name] for name, shown in choice.names.items()}
-    size = TASKS_A_FIGURE if choice.layout.wide else 1
-    for group, plan in _folder_plans(folder, runs, styles, size):
-        if plan.kind not in choice.kinds:
-            continue
-        named = _carry_out(group, plan, choice.layout, title=choice.title)
-        if named is not None:
-            yield named
-
-
-def page_figures(
-    folder: ResultsFolder, runs: pd.DataFrame, kinds: Collection[str]
-) -> Iterator[tuple[NamedFigure, NamedFigure]]:
-    """Yield the figures of some kinds (keys of `KINDS`) for a page, each wide and narrow; tasks one by one.
-
-    Raises:
-        ConfigurationError: not a results folder.
-    """
-    styles = method_styles(runs["controller"].tolist())
-    for group, plan in _folder_plans(folder, runs, styles, 1):
-        if plan.kind in kinds:
-            wide = _carry_out(group, plan, WIDE, title=False)
-            narrow = _carry_out(group, plan, NARROW, title=False)
-            if wide is not None and narrow is not None:
-                yield wide, narrow
+    wide = all(layout.wide for layout in choice.layouts)
+    plans = _folder_plans(folder, runs, styles, TASKS_A_FIGURE if wide else 1, choice.kinds)
+    for number, (group, plan) in share.of(plans):
+        for layout in choice.layouts:
+            named = _carry_out(group, plan, number, layout, title=choice.title)
+            if named is not None:
+                yield named
 
 
 class _Plan(NamedTuple):
@@ -147,19 +150,22 @@ class _Plan(NamedTuple):
 
 
 def _folder_plans(
-    folder: ResultsFolder, runs: pd.DataFrame, styles: Styles, size: int
+    folder: ResultsFolder, runs: pd.DataFrame, styles: Styles, size: int, kinds: Collection[str]
 ) -> Iterator[tuple[Group, _Plan]]:
-    """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
-    if len(runs) > 1:
+    """Yield the figures of some kinds, each with at most `size` tasks, with the group of runs that it shows."""
+    if len(runs) > 1 and "conditions" in kinds:
         everything = Group("", "", runs, int(runs["seed"].min()), {})
         moves, _ = split_tasks(runs)
         yield everything, _Plan("conditions", "", (), partial(draw_conditions, moves, styles))
     for group in load_groups(folder, runs):
         for plan in _plans(group, load_ensembles(folder, group.runs), styles, size):
-            yield group, plan
+            if plan.kind in kinds:
+                yield group, plan
 
 
-def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> NamedFigure | None:
+def _carry_out(
+    group: Group, plan: _Plan, number: int, layout: Layout, *, title: bool
+) -> NamedFigure | None:
     """Return a figure with its name and heading."""
     heading = KINDS[plan.kind].heading
     place = f"{group.plant}, mismatch {group.mismatch}" if group.plant else ""
@@ -182,6 +188,7 @@ def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> Nam
         title=f"{heading}: {details}",
         tasks=plan.tasks,
         figure=figure,
+        number=number,
     )
 
 

@@ -9,6 +9,7 @@ import base64
 import hashlib
 import math
 import re
+from collections.abc import Iterator
 from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ from servobench.harness.analysis.folder import (
     titled_runs,
 )
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.apps.figures.figures import KINDS, page_figures
+from servobench.harness.apps.figures.figures import KINDS, Choice, folder_figures
 from servobench.harness.apps.figures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
 from servobench.harness.apps.figures.tracks import (
     ERROR_COLUMNS,
@@ -41,6 +42,7 @@ from servobench.harness.apps.figures.tracks import (
     longest,
 )
 from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.shares import Share, in_shares
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.variations import varied_columns
@@ -105,6 +107,11 @@ class Picture(NamedTuple):
     wide: Drawing  # for a sheet of paper, a notebook and most screens
     narrow: Drawing  # for a phone
 
+    @property
+    def size(self) -> int:
+        """Its part of the page [bytes]."""
+        return len(self.wide.data) + len(self.narrow.data)
+
 
 def write_report(folder: ResultsFolder, path: Path | None = None) -> Path:
     """Write the report on a results folder, by default `report.html` in it, and return its path.
@@ -122,19 +129,32 @@ def write_report(folder: ResultsFolder, path: Path | None = None) -> Path:
     return target
 
 
-def report_pictures(folder: ResultsFolder, runs: pd.DataFrame) -> list[Picture]:
+def report_pictures(folder: ResultsFolder) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
     pictures = []
     size = 0
-    kinds = [name for name, kind in KINDS.items() if kind.in_page]
-    for named, slim in page_figures(folder, runs, kinds):
-        wide = drawing_of(named.figure, WIDE)
-        narrow = drawing_of(slim.figure, NARROW)
-        size += len(wide.data) + len(narrow.data)
+    for _, kind, title, tasks, wide, narrow in in_shares(_draw_share, folder):
+        picture = Picture(kind, title, tuple(tasks), Drawing(*wide), Drawing(*narrow))
+        size += picture.size
         if size > PICTURE_BYTES:
             break
-        pictures.append(Picture(named.kind, named.title, named.tasks, wide, narrow))
+        pictures.append(picture)
     return pictures
+
+
+def _draw_share(folder: ResultsFolder, share: Share) -> Iterator[tuple[Any, ...]]:
+    """Draw a share of the figures, until it alone fills a page; yield their numbers and what a `Picture` holds."""
+    kinds = [name for name, kind in KINDS.items() if kind.in_page]
+    figures = folder_figures(folder, Choice(kinds, layouts=(WIDE, NARROW), title=False), share)
+    size = 0
+    for named, slim in zip(figures, figures, strict=True):
+        wide = drawing_of(named.figure, WIDE)
+        narrow = drawing_of(slim.figure, NARROW)
+        picture = Picture(named.kind, named.title, named.tasks, wide, narrow)
+        yield named.number, *picture
+        size += picture.size
+        if size > PICTURE_BYTES:
+            return
 
 
 def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
@@ -165,7 +185,7 @@ def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
         band=comparison.settling_band(runs),
         following=comparison.settling_band(runs, FOLLOWING_BANDS),
         published=PUBLISHED,
-        pictures=report_pictures(folder, runs),
+        pictures=report_pictures(folder),
         views=views,
         runs=runs,
         numbered=numbered,
@@ -237,9 +257,7 @@ def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     return known.loc[wrong_first[:SHOWN_RUNS]].sort_index()
 
 
-def _data(
-    folder: ResultsFolder, shown: pd.DataFrame, views: list[dict[str, Any]]
-) -> dict[str, Any]:
+def _data(folder: ResultsFolder, shown: pd.DataFrame, views: list[Json]) -> Json:
     """Return the data of the scripts: runs by their number, with the error over time of those whose steps are kept."""
     curves = error_curves(folder, shown)
     shown = comparison.in_handy_units(shown)
