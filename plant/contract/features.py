@@ -1,6 +1,8 @@
 """The contract of a model whose features depend on joints and on parameters, such as the nominal robot of a run."""
 
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from functools import cached_property
+from typing import NamedTuple
 
 from servobench.plant.contract.checks import FloatArray, Shape
 
@@ -13,35 +15,38 @@ class Derivatives(NamedTuple):
     by_parameter: FloatArray  # ∂y/∂θ, (..., k, m, P), per unit of each parameter
 
 
-class FeatureModel(Protocol):
+class FeatureModel(ABC):
     """The features of the nominal robot as a function of its joints and of P parameters by which it may deviate.
 
     See `servobench.plant.robot.parametric`, which explains states and parameters.
     """
 
     @property
+    @abstractmethod
     def names(self) -> tuple[str, ...]:
         """The names of the parameters."""
-        ...
 
-    @property
+    @cached_property
     def pose_columns(self) -> slice:
         """The place of the cameras' increments among them."""
-        ...
+        return self.columns("camera")
 
     def columns(self, prefix: str) -> slice:
-        """Return the place of the parameters whose names begin with a prefix."""
-        ...
+        """Return the place of the parameters whose names begin with a prefix, such as `gear_`."""
+        found = [index for index, name in enumerate(self.names) if name.startswith(prefix)]
+        if not found:
+            return slice(0, 0)
+        return slice(found[0], found[-1] + 1)
 
+    @abstractmethod
     def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
         """Return θ (..., P) and cameras (..., c, 4, 4) of the nominal robot."""
-        ...
 
+    @abstractmethod
     def moved(
         self, theta: FloatArray, cameras: FloatArray, step: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return both after a step (..., P)."""
-        ...
 
     def feature(
         self,
@@ -51,8 +56,9 @@ class FeatureModel(Protocol):
         turn: FloatArray | None = None,
     ) -> FloatArray:
         """Return features (..., k, m) at joint positions (..., k, n) [rad], the first camera turned by (..., k) rad."""
-        ...
+        return self.derivatives(theta, cameras, joints, turn).feature
 
+    @abstractmethod
     def derivatives(
         self,
         theta: FloatArray,
@@ -61,7 +67,6 @@ class FeatureModel(Protocol):
         turn: FloatArray | None = None,
     ) -> Derivatives:
         """Return the same with derivatives."""
-        ...
 
     def placed(
         self,
@@ -72,4 +77,5 @@ class FeatureModel(Protocol):
         weight: FloatArray,
     ) -> FloatArray:
         """Return cameras that fit features (..., k, m) of weights (..., k) best, or those given without such a form."""
-        ...
+        del theta, joints, features, weight
+        return cameras

@@ -31,7 +31,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, Shape
-from servobench.plant.contract.features import Derivatives
+from servobench.plant.contract.features import Derivatives, FeatureModel
 from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
@@ -76,7 +76,7 @@ class Chain(NamedTuple):
 
 @final
 @dataclass(frozen=True, eq=False)
-class ParametricModel:
+class ParametricModel(FeatureModel):
     """The features of a robot by its joints and parameters.
 
     A state is the pair of `theta`, (..., P), and `cameras`, (..., c, 4, 4). The parameters of a camera's pose are
@@ -98,19 +98,6 @@ class ParametricModel:
         gears = [f"gear_{name}" for name in joints]
         zeros = [f"zero_{name}" for name in joints]
         return (*place, *gears, *zeros, *links, *poses)
-
-    def columns(self, prefix: str) -> slice:
-        """Return the place of the parameters whose names begin with a prefix, such as `gear_`, in θ."""
-        found = [index for index, name in enumerate(self.names) if name.startswith(prefix)]
-        if not found:
-            return slice(0, 0)
-        return slice(found[0], found[-1] + 1)
-
-    @cached_property
-    def pose_columns(self) -> slice:
-        """The place of the cameras' increments in θ."""
-        end = len(self.names)
-        return slice(end - len(POSE) * len(self.planned.poses), end)
 
     def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
         """Return `theta` and `cameras` of the planned robot for leading axes."""

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kit.nightly import some
-from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, M, N, ToyArm, assert_lanes, networks
+from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, M, N, SineModel, ToyArm, assert_lanes, networks
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import Delays
@@ -119,6 +119,7 @@ LANES = 3
 PERIODS = 42
 KNOWING = dataclasses.replace(
     KNOWLEDGE,
+    nominal_model=SineModel(A, np.ones(N)),
     true_jacobian=KNOWLEDGE.nominal_jacobian,
     true_delays=Delays(PERIOD, PERIOD, 0.04),
     region=(np.full(N, -2.0), np.full(N, 2.0)),
@@ -169,7 +170,9 @@ def others():
 
 
 # Named methods are pairs of the parts of `others`
-NAMED = some(METHODS, "regression_mfac", "rbfnn_mfac", "ukf_mpc", "rbf_pid:published")
+NAMED = some(
+    METHODS, "calibrating_mfac", "regression_mfac", "rbfnn_mfac", "ukf_mpc", "rbf_pid:published"
+)
 CHAINS = [
     *(
         pytest.param(

@@ -32,7 +32,7 @@ COMPOSED = [
     pytest.param(entry, id=entry.name) for entry in dict.fromkeys([*METHODS.values(), *PAIRS])
 ]
 EQUIPPED = [name for name in METHODS if not name.endswith(PUBLISHED)]
-CHECKED = some(EQUIPPED, "regression_mfac", "rbfnn_mfac", "ukf_mpc")
+CHECKED = some(EQUIPPED, "calibrating_mfac", "regression_mfac", "rbfnn_mfac", "ukf_mpc")
 ALL = [
     *COMPOSED,
     pytest.param(nmpc_calibrated.ENTRY, id="nmpc_calibrated"),

@@ -19,9 +19,10 @@ from servobench.controllers.networks.config import (
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features
 from servobench.controllers.stages.finish import Finish
-from servobench.plant.contract.features import Derivatives
+from servobench.plant.contract.features import Derivatives, FeatureModel
 from servobench.plant.contract.lanes import take
 from servobench.plant.contract.signals import Observation, PlantSpec
+from servobench.plant.robot.parametric import POSE
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
 TRAINING = TrainingConfig(  # of the smallest networks of a plant of two joints
@@ -40,8 +41,10 @@ def plant_spec(n, m, speed=1.0, reach=6.0):
     )
 
 
-class SineModel:
+class SineModel(FeatureModel):
     """The parametric model of a made-up robot y = A sin(B ((1 + gear) q + zero)), whose camera changes nothing."""
+
+    names = ()
 
     def __init__(self, A, B):
         self.A = A
@@ -50,13 +53,8 @@ class SineModel:
         joints = range(self.n)
         gears = [f"gear_j{i}" for i in joints]
         zeros = [f"zero_j{i}" for i in joints]
-        pose = [f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z")]
+        pose = [f"camera_{each}" for each in POSE]
         self.names = (*gears, *zeros, *pose)
-        self.pose_columns = slice(2 * self.n, 2 * self.n + 6)
-
-    def columns(self, prefix):
-        found = [i for i, name in enumerate(self.names) if name.startswith(prefix)]
-        return slice(found[0], found[-1] + 1) if found else slice(0, 0)
 
     def start(self, lead):
         return np.zeros((*lead, len(self.names))), np.broadcast_to(np.eye(4), (*lead, 1, 4, 4))
@@ -65,9 +63,6 @@ class SineModel:
         theta = theta + step
         theta[..., self.pose_columns] = 0.0
         return theta, cameras
-
-    def feature(self, theta, cameras, joints, turn=None):
-        return self.derivatives(theta, cameras, joints).feature
 
     def derivatives(self, theta, cameras, joints, turn=None):
         gear = 1.0 + theta[..., None, : self.n]
@@ -78,9 +73,6 @@ class SineModel:
         return Derivatives(
             np.matvec(self.A, np.sin(angle)), slope * gear[..., None, :], by_parameter
         )
-
-    def placed(self, theta, cameras, joints, features, weight):
-        return cameras
 
 
 def seen(q, y, valid=True, k=0):

@@ -20,8 +20,10 @@ from servobench.harness.config.source import is_users, show
 from servobench.harness.run.contract import HeldController
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.plant.bench.plant import Plant
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Shape
+from servobench.plant.contract.features import Derivatives, FeatureModel
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.robot.parametric import POSE
 
 PERIOD = 0.05  # [s]
 PREVIEW = 10  # [rows]
@@ -92,6 +94,7 @@ class Rig(Plant):
             self.spec,
             self.conditions.preview,
             self.model_jacobian,
+            RigModel(self),
             region=(-side, side),
             train=self._train,
         )
@@ -153,6 +156,53 @@ class Rig(Plant):
 
     def _symbolic(self, q: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
         return type(q)(self.A) @ (q + BEND * q * q * q)
+
+
+class RigModel(FeatureModel):
+    """The nominal arm of a rig by gears and zeros of its joints, y(g q + o), with a camera that changes nothing."""
+
+    def __init__(self, rig: Rig) -> None:
+        """Take the rig, whose arm has the same features and Jacobian but for `MODEL_ERROR`."""
+        self._rig = rig
+        joints = rig.spec.joint_names
+        gears = [f"gear_{joint}" for joint in joints]
+        zeros = [f"zero_{joint}" for joint in joints]
+        self._names = (*gears, *zeros, *(f"camera_{each}" for each in POSE))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """See `FeatureModel.names`."""
+        return self._names
+
+    def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
+        """See `FeatureModel.start`."""
+        cameras = np.broadcast_to(np.eye(4), (*lead, 1, 4, 4))
+        return np.zeros((*lead, len(self.names))), cameras
+
+    def moved(
+        self, theta: FloatArray, cameras: FloatArray, step: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """See `FeatureModel.moved`."""
+        theta = theta + step
+        theta[..., self.pose_columns] = 0.0
+        return theta, cameras
+
+    def derivatives(
+        self,
+        theta: FloatArray,
+        cameras: FloatArray,
+        joints: FloatArray,
+        turn: FloatArray | None = None,
+    ) -> Derivatives:
+        """See `FeatureModel.derivatives`."""
+        del cameras, turn
+        gear = 1.0 + theta[..., None, self.columns("gear_")]
+        angle = gear * joints + theta[..., None, self.columns("zero_")]
+        slope = MODEL_ERROR * self._rig.jacobian(angle)
+        none = np.zeros((*slope.shape[:-1], len(POSE)))
+        by_parameter = np.concatenate([slope * joints[..., None, :], slope, none], axis=-1)
+        feature = MODEL_ERROR * self._rig.feature(angle)
+        return Derivatives(feature, slope * gear[..., None, :], by_parameter)
 
 
 class Driver:
