@@ -393,8 +393,11 @@ class _Problem:
         rates = self.jacobian(z)[self.names.index("latency")] / prior("latency")
         weight = np.sum(rates**2, axis=1) + 1e-12
         late = -np.sum(rates * error, axis=1) / weight  # [s]
+        told = late[late != 0.0]  # an arm at rest tells none
+        if not told.size:
+            return z
         # Cauchy weights, so that outliers count little.
-        scaled = late / np.median(np.abs(late))
+        scaled = late / np.median(np.abs(told))
         weight = np.sqrt(weight / (1.0 + scaled**2))
         wave = fitted_wave(self.time, late, weight)
         if wave is None:

@@ -22,6 +22,8 @@ from servobench.plant.robot.twin import Parameters
 
 # Features in m that move farther than the nominal robot's by this factor are in another unit.
 MAX_MOTION_RATIO = 20.0  # [1]
+FAR_SHARE = 0.05  # [1] share of the frames by which motions are compared
+LEAST_MOTION = 5e-3  # [m] below which an arm tells no unit
 UNITS = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
 # Something is wrong if residuals exceed the noise from frame to frame by this factor.
 MAX_NOISE_RATIO = 1.5  # [1]
@@ -159,16 +161,26 @@ def _shares(log: Log, robot: Identified) -> FloatArray:
 def _units(log: Log, model: RobotModel) -> str:
     """Name features that are likely in a smaller unit than m."""
     rows = frames_of(log)
-    modelled = float(np.linalg.norm(_spread(model.feature(log.joints[rows]))))
-    logged = float(np.linalg.norm(_spread(log.features[rows])))
-    if log.spec.feature.unit != "m" or logged <= MAX_MOTION_RATIO * modelled:
+    modelled_distances = _distances(model.feature(log.joints[rows]))
+    # Where the arm is farthest: most of the time it may be at rest
+    far = modelled_distances >= np.quantile(modelled_distances, 1.0 - FAR_SHARE)
+    modelled = float(np.median(modelled_distances[far]))
+    logged = float(np.median(_distances(log.features[rows])[far]))
+    if log.spec.feature.unit != "m" or modelled < LEAST_MOTION:
         return ""
-    ratio = logged / max(modelled, 1e-9)
+    if logged <= MAX_MOTION_RATIO * modelled:
+        return ""
+    ratio = logged / modelled
     unit = min(UNITS, key=lambda unit: abs(math.log(ratio * UNITS[unit])))
     return (
         f"features move by {logged:.3g} where this arm moves its ball by {modelled:.3g} m: they are likely in "
         f"{unit}; write them in m"
     )
+
+
+def _distances(values: FloatArray) -> FloatArray:
+    """Return the distances of values (k, m) from their median, (k,)."""
+    return np.linalg.norm(values - np.median(values, axis=0), axis=1)
 
 
 def _spread(values: FloatArray) -> FloatArray:

@@ -175,6 +175,8 @@ def _longer_line(log: Log, robot: Identified) -> str:
     identified = [name for name, is_told in zip(robot.names, robot.told, strict=True) if is_told]
     wanted = [name for name in identified if name not in EXTRAS]
     shares = [(robot.estimate(name)[1] / prior(name), name) for name in wanted]
+    if not shares:
+        return "no parameter of arm or camera is told by itself: lead the arm through more postures"
     share, widest = max(shares)
     # Half the interval needs four times the information, of which the prior is no part.
     longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)

@@ -428,6 +428,31 @@ def test_outliers_and_a_joint_at_rest_are_no_mistakes():
     assert np.sqrt(np.diag(robot.noise)).max() < 0.0015
 
 
+@pytest.mark.parametrize("controller", ["nmpc_calibrated", "rbfnn_mfac"])
+def test_a_short_move_and_a_long_rest_are_no_mistake_and_tell_no_parameter(controller):
+    made = run(controller, task="exp2", settings={"exp2": {"duration": 6.0}})
+    model = find_sensing("position").nominal(find_robot("ur5"))
+    log = read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * math.pi), made.steps)
+    text, robot = mistakes(log, model)
+    assert text == ""
+    assert estimates(robot, None).empty
+    assert remarks(log, robot, None)[-1].startswith("no parameter of arm or camera is told by")
+    # The arm itself moves by a fifth of a metre
+    for unit, size in (("mm", 1e3), ("cm", 1e2), ("inches", 1.0 / 0.0254)):
+        moved = log._replace(features=size * log.features)
+        assert f"likely in {unit}; write them in m" in mistakes(moved, model)[0]
+
+
+def test_an_arm_that_does_not_move_is_no_mistake():
+    log, _, model = logged()
+    rng = np.random.default_rng(5)
+    features = log.features[:1] + rng.normal(0.0, 1e-3, log.features.shape)
+    still = log._replace(joints=np.tile(log.joints[:1], (len(log.joints), 1)), features=features)
+    text, robot = mistakes(still, model)
+    assert text == ""
+    assert estimates(robot, None).empty
+
+
 @pytest.mark.parametrize("pixel", [0.01, 0.02])
 def test_equal_frames_of_a_detector_of_whole_pixels_are_no_mistake(pixel):
     log = logged()[0]
