@@ -101,13 +101,14 @@ def shadow(
         )
     if ahead.empty:
         say(f"{name} gives no Jacobian that could predict a feature")
-    titles = f"{name} beside the log", f"Features one frame ahead, by the Jacobian of {name}"
-    tables = [
-        (title, rows) for title, rows in zip(titles, (apart, ahead), strict=True) if not rows.empty
-    ]
+    titled = {
+        f"{name} beside the log": apart,
+        f"Features one frame ahead, by the Jacobian of {name}": ahead,
+    }
     words = [
         (title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}"))
-        for title, rows in tables
+        for title, rows in titled.items()
+        if not rows.empty
     ]
     print_tables(words, LEGEND)
 
@@ -253,6 +254,9 @@ def _logged(
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.batch.results import ResultsFolder
 
+    read = (log, streams.joints, streams.features, streams.columns)
+    if out and out.exists() and any(out.samefile(file) for file in read if file and file.exists()):
+        raise ConfigurationError(f"--out {out} is the log itself; name another file")
     if streams.joints is not None:
         features = streams.features or streams.joints
         if log or run or not controller:
@@ -260,15 +264,11 @@ def _logged(
                 "--joints is in place of a log and --run, and wants a --controller"
             )
         files = (streams.joints, features, streams.columns)
-        if out and out.exists() and any(out.samefile(file) for file in files if file):
-            raise ConfigurationError(f"--out {out} is the log itself; name another file")
         return str(features), *joined(files, named, controller)
     if not log or streams != USUAL_STREAMS:
         raise ConfigurationError("missing argument 'LOG', or --joints with a file of joints")
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
-    if out is not None and out.exists() and out.samefile(log):
-        raise ConfigurationError(f"--out {out} is the log itself; name another file")
     if log.is_dir():
         resolved, table = logged_in_folder(ResultsFolder(log), run, controller, named[1])
         for word, given, usual in (("robot", named[0], "ur5"), ("sensing", named[1], "position")):
