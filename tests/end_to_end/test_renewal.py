@@ -442,9 +442,7 @@ def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
     if not NIGHTLY:
         return
     (shares,) = others
-    sides = {row[0] for row in shares}
-    assert sides == {"alone", "block"}
-    assert len(shares) == 10
+    assert [row[0] for row in shares] == ["alone"] * 3 + ["block"] * 3  # three methods
     for row in shares:
         parts, whole = map(float, row[2:-1]), float(row[-1])
         assert abs(sum(parts) - whole) < 0.5
