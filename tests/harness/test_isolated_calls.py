@@ -341,3 +341,12 @@ def test_a_daemonic_process_does_a_work_in_shares_alone(monkeypatch):
     monkeypatch.setattr(shares, "available_processors", lambda: 2)
     monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
     assert [each[2] for each in in_shares(squared, (3, os.getpid(), ()))] == [os.getpid()] * 3
+
+
+def test_where_no_process_can_be_started_this_one_does_a_work_in_shares(monkeypatch):
+    def refused() -> int:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(shares, "available_processors", lambda: 2)
+    monkeypatch.setattr(os, "fork", refused)
+    assert [each[2] for each in in_shares(squared, (3, os.getpid(), ()))] == [os.getpid()] * 3
