@@ -279,7 +279,7 @@ class IsolatedProcess:
         with self._lock:
             if self._ended:
                 raise EOFError
-            with _interrupts_blocked(), warnings.catch_warnings():  # a process inherits the former
+            with _signals_blocked(), warnings.catch_warnings():  # a process inherits the former
                 # Python 3.12 warns of the threads of libraries, which only wait.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
@@ -312,9 +312,9 @@ class IsolatedProcess:
 
 
 @contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Hold Ctrl-C back in this thread and in processes that are started meanwhile."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _signals_blocked() -> Iterator[None]:
+    """Hold Ctrl-C and a request to end back in this thread and in processes that are started meanwhile."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:

@@ -110,6 +110,9 @@ def begin(modules: Iterable[str], module: str, function: str, *arguments: object
         function: its name.
         arguments: of the function.
     """
+    # Until it has a handler of its own, a copy would do what its parent does
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     lead_session()
     _prctl(SET_DEATH_SIGNAL, signal.SIGCONT)  # in case that it was stopped
     adopt_orphans()
