@@ -19,7 +19,7 @@ from servobench.plant.contract.checks import FloatArray, IntArray
 from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch, pick
-from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
+from servobench.plant.contract.settings import Delay, Positive, Rows, Usual, settings
 from servobench.plant.contract.signals import BoolArray, JacobianFunction, Observation, PlantSpec
 
 MIN_FEATURES = 3  # number of features that end a rest after its time where frames are lost or slow
@@ -41,7 +41,7 @@ class InitialConfig:
     """[s] rest before a feature counts."""
     average_time: Annotated[Positive, Usual(2.0), Only(source="probe")] = 0.15
     """[s] averaging of valid features at each rest."""
-    given: Annotated[tuple[tuple[Number, ...], ...], Only(source="given")] = ()
+    given: Annotated[Rows, Only(source="given")] = ()
     """[m/rad] m rows of n entries."""
 
 

@@ -16,10 +16,9 @@ from collections.abc import Mapping
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, final
+from typing import Any, final
 
 import numpy as np
-from annotated_types import MinLen
 
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.harness.config.entries import NoSettings
@@ -29,6 +28,7 @@ from servobench.plant.contract.settings import (
     File,
     Names,
     Positive,
+    SomeNames,
     Values,
     nested,
     remark,
@@ -65,11 +65,11 @@ class ControllerMapping:
 
     file: File
     """The .fmu file."""
-    outputs: Annotated[Names, MinLen(1)]
+    outputs: SomeNames
     """Joint velocity commands, rad/s."""
-    features: Annotated[Names, MinLen(1)]
+    features: SomeNames
     """Inputs for the measured features, in the unit of the plant."""
-    reference: Annotated[Names, MinLen(1)]
+    reference: SomeNames
     """Inputs for the desired feature: now, and if there are more at the next instants, row by row."""
     joints: Names = ()
     """Inputs for joint positions, rad."""

@@ -33,6 +33,7 @@ from servobench.plant.contract.settings import (
     NonNegative,
     Number,
     Positive,
+    Rows,
     Share,
     ShareBelowOne,
     Usual,
@@ -63,7 +64,7 @@ class SensingConfig:
     """[s] J; each frame is late by a further U(0, J), without overtaking."""
     noise: Family = "white"
     """Family of the noise of each component."""
-    noise_shape: tuple[tuple[Number, ...], ...] = ()
+    noise_shape: Rows = ()
     """[1] rows of a matrix L that multiplies the noise; empty: identity."""
     noise_share: Annotated[Share, Only(noise=("mixture", "bimodal"))] = 0.1
     """[1] ρ, displaced share, for "mixture" and "bimodal"."""

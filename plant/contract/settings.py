@@ -40,7 +40,7 @@ from typing import (
 )
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import (
     AllowInfNan,
     BeforeValidator,
@@ -143,10 +143,14 @@ def _as_values(value: Any) -> AnyArray:  # noqa: ANN401 - as read from a file
     return _as_numbers(value)
 
 
+Rows: TypeAlias = tuple[tuple[Number, ...], ...]
+"""Rows of finite numbers, as of a matrix."""
 Names: TypeAlias = Annotated[
     tuple[str, ...], BeforeValidator(lambda name: (name,) if isinstance(name, str) else name)
 ]
 """One name or several."""
+SomeNames: TypeAlias = Annotated[Names, MinLen(1)]
+"""The same, but not none."""
 Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
 """An array of numbers; in a file, a number or a list of numbers."""
 Values: TypeAlias = Annotated[AnyArray, BeforeValidator(_as_values)]

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
-from annotated_types import MinLen
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_toml
@@ -25,6 +24,7 @@ from servobench.plant.contract.settings import (
     Names,
     Numbers,
     Positive,
+    SomeNames,
     Usual,
     Values,
     nested,
@@ -122,9 +122,9 @@ class FmuMapping:
 
     file: File
     """The .fmu file."""
-    inputs: Annotated[Names, MinLen(1)]
+    inputs: SomeNames
     """Joint velocity commands, rad/s; they give n."""
-    features: Annotated[Names, MinLen(1)]
+    features: SomeNames
     """The features that the controller gets; they give m."""
     joints: Names = ()
     """Joint positions, rad; without them, commands are integrated."""

@@ -26,6 +26,7 @@ from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import (
     NonNegative,
     Number,
+    Rows,
     ShareBelowOne,
     did_you_mean,
     nested,
@@ -43,7 +44,6 @@ TOOL = ("tool_x", "tool_y", "tool_z")
 LENS = ("focal", "centre_u", "centre_v", "distortion")
 MAX_DEVIATION = 0.5  # [s, m, rad or 1] usual largest deviation of a parameter
 MIN_LENGTH = 1e-6  # [m] a shorter part of a translation is no length
-Rows = tuple[tuple[Number, ...], ...]
 Parameters = Mapping[str, float]  # values by the names of `parameter_names`
 
 
