@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, outer
+from servobench.plant.contract.lanes import matrix, norm, outer
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
@@ -109,8 +109,7 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
     rate_a = across / depth[..., None]
     if optics.further is not None:
         xx, xy, yy = _distortion_slopes(a, optics.distortion, optics.further)
-        rows = (np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1))
-        slope = np.stack(rows, axis=-2)
+        slope = matrix([xx, xy], [xy, yy])
         return optics.focal_lengths[..., None, :, None] * (slope @ rate_a)
     # ∂((1 + k r²) a) = ∂a + k (r² ∂a + 2 a aᵀ ∂a)
     k = optics.distortion[..., None, None, None]

@@ -148,6 +148,11 @@ def outer(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.einsum("...i,...j->...ij", a, b)  # a third faster than a product of views
 
 
+def matrix(*rows: Sequence[FloatArray]) -> FloatArray:
+    """Return matrices, (..., m, n), given the entries of m rows, (...) each."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def nearest_rotation(M: FloatArray) -> FloatArray:
     """Return the rotation R, (..., m, m), nearest to M, (..., m, m), in the Frobenius norm: it maximises trace(RᵀM).
 

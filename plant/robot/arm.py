@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, Shape, as_array
+from servobench.plant.contract.lanes import matrix
 
 # IntArray of the factors in a cross product
 YZX = np.array([1, 2, 0])
@@ -45,8 +46,7 @@ def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
     x_row = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
     y_row = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
     z_row = [-sp, cp * sr, cp * cr]
-    rows = [np.stack(row, axis=-1) for row in (x_row, y_row, z_row)]
-    return np.stack(rows, axis=-2)
+    return matrix(x_row, y_row, z_row)
 
 
 def rpy_from_rotation(R: FloatArray) -> FloatArray:

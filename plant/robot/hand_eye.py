@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, Shape, as_array
+from servobench.plant.contract.lanes import matrix
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
 from servobench.plant.robot.arm import (
     JointLimits,
@@ -195,8 +196,7 @@ def rotation_matrix(vector: npt.ArrayLike) -> FloatArray:
     x_row = [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)]
     y_row = [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)]
     z_row = [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww]
-    rows = [np.stack(row, axis=-1) for row in (x_row, y_row, z_row)]
-    return np.stack(rows, axis=-2)
+    return matrix(x_row, y_row, z_row)
 
 
 def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> FloatArray:
