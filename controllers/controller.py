@@ -18,9 +18,14 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.features import FeatureModel
-from servobench.plant.contract.signals import Command, JacobianFunction, Observation, PlantSpec
+from servobench.plant.contract.signals import (
+    Command,
+    JacobianFunction,
+    Observation,
+    PlantSpec,
+    SymbolicFeature,
+)
 
-SymbolicFeature: TypeAlias = Callable[[Any], Any]
 Diagnostics: TypeAlias = Mapping[str, npt.ArrayLike]
 
 

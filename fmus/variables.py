@@ -20,11 +20,11 @@ import numpy as np
 
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.optics import COLUMNS
-from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
+from servobench.plant.cameras.setups import SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray, NamedArrays, Shape
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
-from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.hand_eye import Mount, RobotModel
 
 ARM = "ur5_mismatched"  # folder of the model that serves every arm
 # Roles of variables.

@@ -24,7 +24,7 @@ from servobench.harness.run.resolution import ResolvedRun, check_settings, resol
 from servobench.harness.run.sampling import Drawn
 from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.contract.checks import AnyArray, FloatArray, as_array
+from servobench.plant.contract.checks import AnyArray, FloatArray, Floats32, as_array
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_seed
@@ -36,7 +36,6 @@ from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch
 
-Floats32: TypeAlias = npt.NDArray[np.float32]
 Info: TypeAlias = dict[str, Any]  # facts beside an observation, by name
 FEATURE_BOUND = 10.0  # natural sizes, beyond which features and errors are clipped
 LATENESS_BOUND = 2.0  # [s] beyond which the lateness of a frame is clipped

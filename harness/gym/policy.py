@@ -21,8 +21,8 @@ from onnxruntime import InferenceSession, SessionOptions
 
 from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.harness.config.entries import NoSettings
-from servobench.harness.gym.environment import Floats32, Spaces
-from servobench.plant.contract.checks import FloatArray
+from servobench.harness.gym.environment import Spaces
+from servobench.plant.contract.checks import FloatArray, Floats32
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.signals import Command, Observation
 

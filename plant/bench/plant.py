@@ -23,6 +23,7 @@ from servobench.plant.contract.signals import (
     JacobianFunction,
     Observation,
     PlantSpec,
+    SymbolicFeature,
     Truth,
 )
 from servobench.plant.robot.arm import JointLimits
@@ -38,8 +39,7 @@ class TrueModel:
     """The kinematics of the true robot and the delays of commands and features; for upper bounds only."""
 
     jacobian: JacobianFunction
-    # from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1)
-    symbolic: Callable[[Any], Any]
+    symbolic: SymbolicFeature
     latency: float = 0.0  # between exposure and delivery of a frame, s
     command_delay: float = 0.0  # between a command and its first effect, s
     lag: float | None = (

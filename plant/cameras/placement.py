@@ -25,13 +25,13 @@ from math import atan2, cos, radians, sin
 import numpy as np
 
 from servobench.plant.cameras.optics import COLUMNS, NEAR, Optics, ideal_optics
-from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
+from servobench.plant.cameras.setups import SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import remark
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera_file import OwnCamera, turning_point
-from servobench.plant.robot.hand_eye import rotation_matrix, turn_about
+from servobench.plant.robot.hand_eye import Mount, rotation_matrix, turn_about
 from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import camera_pose

@@ -12,9 +12,9 @@ from servobench.plant.cameras.placement import (
     nominal_model,
     true_model,
 )
-from servobench.plant.cameras.setups import PIXEL, PLATE, POSITION, STEREO, Mount, SensingSetup
+from servobench.plant.cameras.setups import PIXEL, PLATE, POSITION, STEREO, SensingSetup
 from servobench.plant.contract.settings import suggest
-from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
+from servobench.plant.robot.hand_eye import HandEyeModel, Mount, RobotModel
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample
 from servobench.plant.robot.robot import Robot
 

@@ -25,7 +25,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Literal, Self, TypeAlias, final
+from typing import Self, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +38,7 @@ from servobench.plant.contract.sensing import EXTENTS, LENGTH
 from servobench.plant.contract.signals import SETTLING_BAND, BoolArray, Channel
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
-from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.hand_eye import Mount, RobotModel
 
 Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 """Points (..., c, p, 3) [m] in the frame of each camera, and the optics -> features (..., m)."""
@@ -293,8 +293,6 @@ PLATE = in_pixels(
 )
 
 
-Mount: TypeAlias = Literal["fixed", "hand"]
-"""Whether the cameras are beside the arm and the target on it, or the reverse."""
 MIN_INCIDENCE = 0.2  # cosine of the angle beyond which discs on a plate are not valid
 
 

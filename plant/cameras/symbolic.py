@@ -16,12 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics, project
-from servobench.plant.cameras.setups import MIN_INCIDENCE, POSITION, Mount, SensingSetup, SetupModel
+from servobench.plant.cameras.setups import MIN_INCIDENCE, POSITION, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import CAMERA
-from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
+from servobench.plant.robot.hand_eye import HandEyeModel, Mount, RobotModel
 
 Expressions: TypeAlias = npt.NDArray[Any]
 """An array of CasADi expressions."""

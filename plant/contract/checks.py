@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int_]
+Floats32 = npt.NDArray[np.float32]
 AnyArray = npt.NDArray[Any]
 NamedArrays: TypeAlias = Mapping[str, FloatArray]
 Shape: TypeAlias = tuple[int, ...]  # sizes of axes, often of the leading ones alone

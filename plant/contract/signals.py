@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ from servobench.plant.contract.checks import (
 BoolArray = npt.NDArray[np.bool_]
 # Joint positions (..., n) rad -> (..., m, n), unit of the feature per rad
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
+# CasADi expression (MX) of the joint positions, (n, 1) rad -> that of the feature, (m, 1)
+SymbolicFeature: TypeAlias = Callable[[Any], Any]
 JOINT_UNIT = "rad"
 COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
 NAME_LENGTH = 100  # [letters] in the name of a joint or feature

@@ -30,7 +30,7 @@ from scipy.ndimage import convolve1d
 
 from servobench.plant.cameras.optics import Optics, ideal_optics, locate
 from servobench.plant.cameras.setups import SensingSetup, SetupModel
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Floats32
 from servobench.plant.contract.lanes import take
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import BoolArray, Truth
@@ -116,7 +116,7 @@ class Lens:
         """
         own = take(optics, slice(camera, camera + 1))
         self._ideal = planned
-        self._map: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None = None
+        self._map: tuple[Floats32, Floats32] | None = None
         if as_planned(own, planned):
             return
         rays = _rays(planned, own)

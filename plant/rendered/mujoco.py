@@ -21,9 +21,8 @@ from typing import Any
 import cv2
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Floats32
 from servobench.plant.contract.faults import one_line
 from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
@@ -178,7 +177,7 @@ class MujocoScene(Scene):
 
     def draw(
         self, camera: PinholeCamera, X_BC: FloatArray, window: Window
-    ) -> tuple[ByteArray, npt.NDArray[np.float32]]:
+    ) -> tuple[ByteArray, Floats32]:
         """Return colours (h, w, 3) and depths (h, w) of a window as OpenGL has them, with the lowest row first.
 
         Depths fall from 1 at the near plane to 0 at the far one, where float32 is finest.

@@ -10,7 +10,7 @@ The robots of many runs side by side are one model, whose arrays have leading ax
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -35,13 +35,17 @@ ROTATION_TOLERANCE = 1e-9  # [1]
 WAY_FROM_HOME = np.linspace(1.0, 0.0, 21)
 
 
+Mount: TypeAlias = Literal["fixed", "hand"]
+"""Whether the cameras are beside the arm and the target on it, or the reverse."""
+
+
 class RobotModel(ABC):
     """An arm and its cameras, y = h(q) and J = ∂h/∂q; pure, over leading axes."""
 
     arm: SerialArm
     """The arm."""
-    mount: Literal["fixed", "hand"]
-    """Whether the cameras are beside the arm and the target on it, or the reverse."""
+    mount: Mount
+    """Where the cameras are mounted."""
 
     @property
     def lead(self) -> Shape:

@@ -8,7 +8,6 @@ base frame. Gravity is left out: the ball rests at δ = 0. Play is exact where q
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple, TypeAlias
 
@@ -19,6 +18,7 @@ from servobench.plant.contract.checks import FloatArray, fewest_parts
 from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, Usual, settings
+from servobench.plant.contract.signals import JacobianFunction
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
 # In each part of a period play is updated once and the acceleration of a tool changes linearly.
@@ -138,7 +138,7 @@ def transmitted(q: FloatArray, ripple: float | FloatArray, order: float) -> Floa
 class RippledJacobian:
     """A Jacobian by reported joint positions, made of one by the joints behind gears without play."""
 
-    function: Callable[[FloatArray], FloatArray]
+    function: JacobianFunction
     mechanics: MechanicsConfig
 
     def __call__(self, joint_position: FloatArray) -> FloatArray:
