@@ -63,6 +63,7 @@ BLOCK = 256  # [runs] that advance together: networks of more of them leave the 
 RUN_ID = "run_id"
 TASKS_PER_WORKER = 2  # handed out at a time, so that no worker waits for its next task
 CHUNK = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
+Packed = tuple[tuple[SourceFile, ...], bytes]  # files of users, and the rest of a task, pickled
 
 
 @dataclass(frozen=True)
@@ -273,7 +274,7 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
         raise ConfigurationError(refused[0])
 
 
-def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
+def _build(packed: Packed, tell: Tell) -> None:
     """Build a run in a worker and report the training of its networks, and a wrong configuration."""
     with delayed_releases():
         try:
@@ -287,7 +288,7 @@ def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
             tell(["remark", text])
 
 
-def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
+def _carry_out_there(packed: Packed, tell: Tell) -> None:
     """Carry a block out in a worker; where it cannot be read, for instance without its plug-in, report why."""
     try:
         block, steps, keep = _receive(packed)
@@ -304,7 +305,7 @@ def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -
         _carry_out(block, answer, steps, keep, debug=False)
 
 
-def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
+def _receive(packed: Packed) -> tuple[Block, bool, Path | None]:
     """Return the content of a task, and import its plant and controller; the row tells of one that cannot be.
 
     Raises:
