@@ -45,6 +45,8 @@ MIN_PAIRS = 6
 # The difference in the share of lost runs up to which methods may be equivalent
 LOST_MARGIN = 0.03  # [1]
 Verdict = Literal["better", "equivalent", "worse", "undecided"]
+Pair = tuple[str, str]  # names of two controllers
+PageRow = dict[tuple[str, str], Any]  # cells by group and heading
 RESAMPLES = 2000
 DRAWN_AT_ONCE = 1_000_000  # values of resamples in memory; the same are drawn for any number
 MISSING = "–"  # text for a number that there is not
@@ -526,7 +528,7 @@ def knows_truth(name: str) -> bool:
 
 def compare_pairs(
     runs: pd.DataFrame,
-    pairs: Sequence[tuple[str, str]],
+    pairs: Sequence[Pair],
     *,
     metric: str = "settling_time_s",
     keys: Sequence[str] = KEYS,
@@ -547,7 +549,7 @@ def compare_pairs(
 
 
 def _paired_values(
-    runs: pd.DataFrame, pair: tuple[str, str], metric: str, keys: Sequence[str]
+    runs: pd.DataFrame, pair: Pair, metric: str, keys: Sequence[str]
 ) -> tuple[pd.Series[float], pd.Series[float]]:
     """Return the values of two controllers on the runs that they share, by the keys of these; NaN of lost ones."""
     values = direction(metric) * column_of(runs, metric).where(runs["status"] == COMPLETED)

@@ -16,6 +16,7 @@ import pandas as pd
 
 from servobench.harness.analysis.comparison import (
     ALPHA,
+    Pair,
     knows_truth,
     margin,
     metric_heading,
@@ -32,7 +33,6 @@ from servobench.plant.contract.settings import suggest
 EVERY = 16  # seeds from look to look
 DECISIONS = "decisions.csv"
 CLIPPED = "mean clipped difference"  # column of it; each difference counts up to `CLIP` margins
-Pair = tuple[str, str]
 
 
 @dataclass(frozen=True)

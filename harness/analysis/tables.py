@@ -24,6 +24,8 @@ from servobench.harness.analysis.comparison import (
     POINT_TO_POINT,
     SEQUENCE,
     Estimate,
+    PageRow,
+    Pair,
     achieved_share,
     achievement,
     column_of,
@@ -265,9 +267,7 @@ def _controller_rows(runs: pd.DataFrame, selection: Selection) -> list[Row]:
     return rows
 
 
-def _pairs(
-    runs: pd.DataFrame, names: Iterable[str], against: str | None = None
-) -> list[tuple[str, str]]:
+def _pairs(runs: pd.DataFrame, names: Iterable[str], against: str | None = None) -> list[Pair]:
     """Return pairs of some controllers of a place, those that share a seed: a batch may be unfinished."""
     seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller")}
     present = [name for name in names if name in seeds]
@@ -494,8 +494,6 @@ MEANINGS = {
     JOINT_AT_LIMIT: "a joint stood at its stop for a second while the error was too large",
 }
 MOST_PLACES = 5  # that have columns of their own in the overview
-
-PageRow = dict[tuple[str, str], Any]
 
 
 def overview(runs: pd.DataFrame) -> pd.DataFrame:

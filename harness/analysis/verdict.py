@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ import pandas as pd
 from servobench.harness.analysis.comparison import (
     MIN_PAIRS,
     Difference,
+    PageRow,
     achieved_share,
     achievement,
     column_of,
@@ -358,7 +359,7 @@ def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[str, dict[str, Diff
     return first, against, small
 
 
-def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
+def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> PageRow:
     """Return a row of `leaders`: the first two controllers of a place, and those that are not shown to be behind."""
     table = judged_values(place)
     shares = _shares(own)

@@ -9,7 +9,7 @@ settle. A challenge whose references both lose more than `MAX_REFERENCE_LOSS` of
 grade and no part in the ranking.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from servobench.harness.analysis.decisions import (
     answer,
     answer_table,
 )
-from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
+from servobench.harness.analysis.tables import Cell, Row, Tables, as_plain, as_text
 from servobench.harness.apps.figures import style
 from servobench.harness.apps.studies.audit import mark_solved
 from servobench.harness.apps.studies.challenge import MEASURES, Challenge
@@ -256,7 +256,7 @@ def ranking_rows(judged: pd.DataFrame) -> list[Row]:
     return rows
 
 
-def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+def suite_tables(judged: pd.DataFrame) -> Tables:
     """Yield titles and tables of text: one for each challenge and plant, and the ranking on each plant."""
     titles = dict(zip(judged["challenge"], judged["title"], strict=True))
     rows = as_text(methods_rows(judged))
