@@ -36,7 +36,7 @@ WAY_FROM_HOME = np.linspace(1.0, 0.0, 21)
 
 
 Mount: TypeAlias = Literal["fixed", "hand"]
-"""Whether the cameras are beside the arm and the target on it, or the reverse."""
+"""Where cameras are mounted."""
 
 
 class RobotModel(ABC):
@@ -45,7 +45,7 @@ class RobotModel(ABC):
     arm: SerialArm
     """The arm."""
     mount: Mount
-    """Where the cameras are mounted."""
+    """Whether the cameras are beside the arm and the target on it, or the reverse."""
 
     @property
     def lead(self) -> Shape:
