@@ -348,7 +348,8 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
             ]
     numeric = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)
     if numeric and any(isinstance(each, float) for each in values):
-        values = [float(each) for each in values]
+        # A whole number beyond all floats is inf as one, and refused as such
+        values = [float(str(each)) for each in values]
     found = _in_one_way(name, values)
     if not found or "" in found:
         raise ValueError(

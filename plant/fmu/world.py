@@ -392,6 +392,8 @@ class FmuWorld(World):
         self._integrated = self._integrated[lanes]
         if self._seen is not None:
             self._seen = self._seen[lanes]
+        if self._captured is not None:
+            self._captured = self._captured[lanes]
 
     def save(self) -> FmuState:
         """Return the present state of the FMU; see `Plant.save`.

@@ -124,6 +124,18 @@ def test_an_output_can_be_the_time_of_capture(tmp_path):
     whole.close()
 
 
+def test_lanes_that_stay_keep_their_times_of_capture(tmp_path):
+    path = build_stub(tmp_path)
+    named = 'features = ["y[1]"]\ncaptured = "y[2]"'
+    path.write_text(path.read_text().replace('features = ["y"]', named))
+    world = FmuWorld(read_mapping(FmuMapping, path), np.zeros((3, 2)), 0.05)
+    world.reset([0, 1, 2])
+    before = world.captured()
+    world.keep(np.array([0, 2]))
+    np.testing.assert_array_equal(world.captured(), before[[0, 2]])
+    world.close()
+
+
 @pytest.mark.parametrize(
     ("text", "more", "message"),
     [

@@ -193,6 +193,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*SWEEP, "--period", "0"), "run.period must be at least 0.0001, got 0"),
     ((*SWEEP, "--period", "fast"), "run.period must be a number, got 'fast'"),
     ((*SWEEP, "--vary", "run.period=0:0.2:0.05"), "run.period must be at least 0.0001, got 0"),
+    ((*SWEEP, "--vary", f"plant.lag=0.1,{10**400}"), "kinematic.lag must be finite, got inf"),
     ((*SWEEP, "--vary", "run.perod=0.1"), "run has no setting 'perod': did you mean 'period'?"),
     ((*SWEEP, "--vary", "plant.lag=1:0:0.5"), "--vary: the range '1:0:0.5' of plant.lag is empty"),
     ((*SWEEP, "--vary", "plant.lag="), "--vary: plant.lag needs values, such as run.period=0.02,0.05"),
