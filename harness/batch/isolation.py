@@ -168,7 +168,7 @@ class Pool:
         for isolated in self._isolated:
             isolated.ask_to_end()
         for isolated in self._isolated:
-            isolated.end()
+            isolated.end(patience)
 
     def _carry_out(self, task: Task, hear: Tell | None) -> Answer:
         if not hasattr(self._own, "isolated"):
