@@ -68,6 +68,14 @@ def test_rows_are_those_of_numpy_and_of_each_run_alone(controller, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("period", some((0.008, 0.02, 0.028), 0.02))
+def test_rows_at_short_periods_are_those_of_numpy(period):
+    settings = {"run": {"period": period}, "random": {"duration": 1.0}}
+    in_c = rows(carry_out_together(runs("ukf_mfac", True, settings)))
+    assert_near(in_c, rows(carry_out_together(runs("ukf_mfac", False, settings))))
+
+
+@pytest.mark.slow
 def test_pixels_and_lost_features_are_those_of_numpy():
     settings = {
         "kinematic": {"sensing": {"drop_probability": 0.65}},
