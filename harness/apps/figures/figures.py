@@ -90,7 +90,7 @@ class Choice:
 
 
 class Order(NamedTuple):
-    """Figures that files are to hold."""
+    """Which figures are drawn, and into which files."""
 
     folder: ResultsFolder
     target: Path  # folder of the files
