@@ -165,6 +165,8 @@ class ResultsFolder:
             )
         if "time_s" in steps and not steps["time_s"].between(0.0, tables.MAX_TIME).all():
             raise ConfigurationError(f"{self.path} holds steps at no time")
+        if len(run_ids or ()) == 1:
+            return of_one_run(steps)
         return steps
 
     def other_tables(self) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -339,6 +341,15 @@ class ResultsFolder:
             names = [kind]
         self.refuse_damaged(names)
         return names
+
+
+def of_one_run(steps: pd.DataFrame) -> pd.DataFrame:
+    """Return the steps of one run without the columns of other runs in its folder, with other features or joints."""
+    known = steps.filter(regex="^(reference|joint_position|joint_velocity_command)_")
+    absent = known.columns[known.isna().all()]
+    features = absent.str.removeprefix("reference_")
+    foreign = [*absent, *("feature_" + features), *("true_feature_" + features)]
+    return steps.drop(columns=foreign, errors="ignore")
 
 
 def load_runs(folder: Path) -> pd.DataFrame:

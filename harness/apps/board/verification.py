@@ -14,7 +14,7 @@ from servobench.harness.apps.board.protocol import COLUMNS, Finding, Hear, Verdi
 from servobench.harness.batch.consistency import find_contradiction
 from servobench.harness.batch.fingerprint import fingerprint
 from servobench.harness.batch.logs import run_in_folder
-from servobench.harness.batch.results import ResultsFolder
+from servobench.harness.batch.results import ResultsFolder, of_one_run
 from servobench.harness.config.registry import is_foreign_controller
 from servobench.harness.run.episode import carry_out
 from servobench.harness.run.request import RunSettings
@@ -148,7 +148,8 @@ def _hold_rows(folder: ResultsFolder) -> Iterator[Finding]:
         period = dict(varied_in_row(row)).get("run.period", usual)
         try:
             with np.errstate(all="ignore"), configuration_errors("", KeyError, TypeError):
-                fault = find_contradiction(row, known.get(row["run_id"], pd.DataFrame()), period)
+                own = of_one_run(known.get(row["run_id"], pd.DataFrame()))
+                fault = find_contradiction(row, own, period)
         except ConfigurationError as error:
             fault = f"its steps cannot be read: {error}"
         if fault:

@@ -29,7 +29,9 @@ def watch(folders: Iterable[Path], note: Callable[[str], None]) -> None:
     """Note from now on what this process touches besides files of the system, of packages and in some folders."""
     prefixes = Path(sys.prefix), Path(sys.base_prefix)
     known = (*folders, PACKAGE_FOLDER, cache_folder(NETWORKS), *prefixes)
-    allowed = (*SYSTEM, *(str(each.absolute()) for each in known))
+    # As code may name them, and without links
+    places = [path for each in known for path in (os.path.abspath(each), str(each.resolve()))]  # noqa: PTH100
+    allowed = (*SYSTEM, *places)
 
     def hear(event: str, arguments: tuple[Any, ...]) -> None:
         if event in TOUCHES:

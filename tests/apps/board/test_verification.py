@@ -101,6 +101,28 @@ def test_code_that_reaches_out_is_named_though_its_commands_are_the_same(tmp_pat
     assert BY_THE_WAY[code] in wrong[0].text
 
 
+@pytest.mark.parametrize("name", ["sub/../mine.py", "link/mine.py"])
+def test_code_is_its_own_by_any_path(tmp_path, name):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path)
+    own = "        open(__file__).close()\n        return serv"
+    folder = made(tmp_path, HONEST.replace("        return serv", own))
+    found = hold(folder, {"Mine": find_code(f"./{name}")}, 9)
+    assert {each.verdict for each in found} == {"ok"}, found
+
+
+def test_rows_of_several_sensings_follow_from_their_own_steps(tmp_path):
+    folder = tmp_path / "out"
+    compare(["constant"], tasks=["exp1"], seeds=1, sensings=["position", "pixel"], out=folder)
+    opened = ResultsFolder(folder)
+    found = hold(opened, {})
+    assert {each.verdict for each in found} == {"ok"}, found
+    of_pixels = opened.steps(["kinematic-pixel-constant-exp1-moderate-0"])
+    features = [name for name in of_pixels if name.startswith(("reference_", "true_feature_"))]
+    assert features
+    assert all(name.endswith("_px") for name in features)
+
+
 @pytest.mark.parametrize("what", KNOWING)
 def test_commands_from_more_than_the_observations_are_found(tmp_path, what):
     text = HONEST.replace("np.arange(self.n) +", f"np.arange(self.n) + {KNOWING[what]} +")
