@@ -228,8 +228,7 @@ def _parts(folder: ResultsFolder, manifest: Manifest) -> Iterator[_Part]:
     campaign = manifest.get("campaign")
     end = 0
     for index in folder.part_indices():
-        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
-        names = [name for name in names if folder.expects(name)]
+        names = folder.files_of_part(index)
         rows = part_name(index, RUNS)
         count = 0
         faults = {name: wrong for name in names if (wrong := _fault(folder, name))}

@@ -12,10 +12,8 @@ from servobench.harness.batch import store, tables
 from servobench.harness.batch.differences import check_same_batch
 from servobench.harness.batch.lock import check_empty
 from servobench.harness.batch.results import (
-    FAILURES,
     PICTURES,
     RUNS,
-    STEPS,
     ResultsFolder,
     part_name,
 )
@@ -79,8 +77,7 @@ def copy_parts(parts: Iterable[tuple[ResultsFolder, int]], other: Path) -> None:
     """
     files: store.Files = {}
     for folder, index in parts:
-        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
-        names = [name for name in names if folder.expects(name)]
+        names = folder.files_of_part(index)
         folder.refuse_damaged(names)
         networks = sorted((folder.path / NETWORKS).glob("*.npz"))
         names = [

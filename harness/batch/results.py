@@ -254,6 +254,11 @@ class ResultsFolder:
         names = (part_name(index, kind) for index in self.part_indices())
         return [name for name in names if self.expects(name)]
 
+    def files_of_part(self, index: int) -> list[str]:
+        """Return the names of the files that a part has, or should have, its rows last."""
+        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
+        return [name for name in names if self.expects(name)]
+
     def finished_runs(self) -> list[range]:
         """Return the indices of the runs whose part is there, in order."""
         found = []

@@ -80,7 +80,7 @@ def statistics(
         metric = add_metric(opened, metric)
     runs = titled_runs(opened)
     opened.check_runs(runs)
-    shown = selection.split_names("controllers", controllers, list(runs["controller"].unique()))
+    shown = selection.split_shown(controllers, runs)
     if against is not None and against not in shown:
         raise ConfigurationError(f"--against: unknown {against!r}: {suggest(against, shown)}")
     labels = selection.split_labels(names, shown)

@@ -12,6 +12,8 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import split_words
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from servobench.harness.batch.results import ResultsFolder
     from servobench.harness.batch.trials import Word
 
@@ -228,6 +230,11 @@ def split_names(
         if names.count(name) > 1:
             raise ConfigurationError(f"--{option} names {name} twice")
     return tuple(names)
+
+
+def split_shown(text: str, runs: pd.DataFrame) -> tuple[str, ...]:
+    """Return the controllers of a table of runs that a comma-separated list names."""
+    return split_names("controllers", text, list(runs["controller"].unique()))
 
 
 def choose_metrics(places: Sequence[str] | None) -> tuple[str, ...]:

@@ -38,8 +38,7 @@ def export(
     if run is not None:
         chosen = find_run(opened, run)["run_id"]
         runs = runs[runs["run_id"] == chosen]
-    known = list(dict.fromkeys(runs["controller"]))
-    runs = runs[runs["controller"].isin(selection.split_names("controllers", controllers, known))]
+    runs = runs[runs["controller"].isin(selection.split_shown(controllers, runs))]
     say(opened.describe_missing())
     files = export_folder(opened, out, format_, runs)
     say(f"{len(files)} files in {out}")

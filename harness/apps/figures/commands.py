@@ -69,8 +69,7 @@ def figures(
     selection.add_metrics(opened, metric)
     runs = opened.runs()
     opened.check_runs(runs)
-    known = list(dict.fromkeys(runs["controller"]))
-    shown = selection.split_names("controllers", controllers, known)
+    shown = selection.split_shown(controllers, runs)
     labels = selection.split_labels(names, shown)
     if "pgf" in formats:
         check_tex()
