@@ -28,7 +28,7 @@ from servobench.controllers.methods import MethodConfig
 from servobench.controllers.servo import Servo, ServoController
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.settings import override
+from servobench.plant.contract.settings import Section, override
 from servobench.plant.contract.signals import Command, Observation
 
 
@@ -113,7 +113,7 @@ class AidedController(Controller):
         return self._chain.estimated_jacobian()
 
 
-def with_aids(entry: ControllerEntry, aids: Mapping[str, Any]) -> ControllerEntry:
+def with_aids(entry: ControllerEntry, aids: Section) -> ControllerEntry:
     """Return the entry of a controller with aids, whose own settings become the section `law`.
 
     Raises:

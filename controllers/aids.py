@@ -21,6 +21,7 @@ from servobench.plant.contract.settings import (
     Deviation,
     NonNegative,
     Positive,
+    Section,
     Share,
     settings,
 )
@@ -151,11 +152,11 @@ class _Fixed(dict[str, Any]):
         return dict, (dict(self),)
 
 
-EQUIPPED: Mapping[str, Any] = _Fixed({name: switch.equipped for name, switch in SWITCHES.items()})
+EQUIPPED: Section = _Fixed({name: switch.equipped for name, switch in SWITCHES.items()})
 """The value of each aid in a best equipped method."""
 
 
-def describe_aids(values: Mapping[str, Any]) -> str:
+def describe_aids(values: Section) -> str:
     """Return which aids a controller has by its settings, whose keys have dots: with all, without, with some."""
     none = AidsConfig()
     on = []

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.features import FeatureModel
+from servobench.plant.contract.settings import Section
 from servobench.plant.contract.signals import (
     Command,
     JacobianFunction,
@@ -105,7 +106,7 @@ class Controller(ABC):
         in_model_frame: whether it was trained on the nominal model, so that with aids it works in that model's frame.
     """
 
-    aids: ClassVar[Mapping[str, Any] | None] = None
+    aids: ClassVar[Section | None] = None
     in_model_frame: ClassVar[bool] = False
 
     @abstractmethod
@@ -179,4 +180,4 @@ class ControllerEntry:
     build: Callable[[Any, RobotKnowledge], Controller]
     needs_truth: bool = False
     side_by_side: bool = False
-    tuned: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    tuned: Section = field(default_factory=dict, compare=False)

@@ -22,7 +22,7 @@ from servobench.controllers.networks.config import ControllerTraining, TrainingC
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.servo import Servo, ServoController
 from servobench.controllers.units import in_natural_units
-from servobench.plant.contract.settings import did_you_mean
+from servobench.plant.contract.settings import Section, did_you_mean
 
 Kind = TypeVar("Kind")
 
@@ -110,15 +110,15 @@ class Method:
     estimator: str  # a name in `ESTIMATORS`
     summary: str  # one line for `servobench controllers`
     # settings of the law that differ from its own defaults
-    law_defaults: Mapping[str, object] = field(default_factory=dict)
+    law_defaults: Section = field(default_factory=dict)
     # settings of the aids that differ from none
-    aids: Mapping[str, Any] = field(default_factory=dict)
+    aids: Section = field(default_factory=dict)
     # settings of the law as published that differ from its own defaults; None: it is not published
-    printed: Mapping[str, object] | None = None
+    printed: Section | None = None
     # settings of the estimator that differ from its own defaults where there are aids
-    estimator_defaults: Mapping[str, object] = field(default_factory=dict)
+    estimator_defaults: Section = field(default_factory=dict)
     # those of the controller network's training, likewise
-    network_defaults: Mapping[str, Any] = field(default_factory=dict)
+    network_defaults: Section = field(default_factory=dict)
 
     def divisions(self) -> list[Self]:
         """Return the method best equipped and, where there is one, as published: without aids, its law as printed."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import pandas as pd
 
@@ -28,6 +27,7 @@ from servobench.harness.analysis.sequential import CLIP, Decision, decide
 from servobench.harness.analysis.verdict import judged_column, judged_metric
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import Record
 from servobench.plant.contract.settings import suggest
 
 EVERY = 16  # seeds from look to look
@@ -82,7 +82,7 @@ class Question:
         """Numbers of seeds after which one looks."""
         return [*range(EVERY, len(self.seeds), EVERY), len(self.seeds)]
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Record:
         """Return the entry of the manifest."""
         return {"pairs": [list(pair) for pair in self.pairs], "worlds": self.worlds}
 

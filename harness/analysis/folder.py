@@ -10,12 +10,12 @@ from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
 from servobench.harness.batch.results import Manifest, ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS, FILES
-from servobench.harness.config.settings import Section, tuned_settings
+from servobench.harness.config.settings import tuned_settings
 from servobench.harness.config.source import find_place
 from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
-from servobench.plant.contract.settings import listed
+from servobench.plant.contract.settings import Section, listed
 
 # Columns, with settings that are varied
 DESCRIBED = ("plant", "sensing", "controller", "task", "mismatch")

@@ -3,7 +3,7 @@
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -17,6 +17,7 @@ from servobench.harness.batch.results import Manifest
 from servobench.harness.config.installation import short_commit
 from servobench.harness.run.outcome import FOLLOWED, SETTLED
 from servobench.harness.run.variations import varied_columns
+from servobench.plant.contract.settings import Section
 
 SIGNS = str.maketrans(
     {
@@ -225,7 +226,7 @@ def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
     return f"Varied: {'; '.join(varied)}"
 
 
-def _settings(changed: Mapping[str, Any] | None) -> str:
+def _settings(changed: Section | None) -> str:
     """Return a sentence on settings that were changed; None if the manifest does not say which."""
     if changed is None:
         return "All settings are in the file manifest.json of the results"

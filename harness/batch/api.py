@@ -33,7 +33,7 @@ from servobench.harness.config.registry import (
     offered,
     offering,
 )
-from servobench.harness.config.settings import Section, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_seed
 from servobench.harness.run.resolution import check_settings
@@ -42,7 +42,7 @@ from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import native, remark
+from servobench.plant.contract.settings import Section, native, remark
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 from servobench.plant.robot.mismatch import Mismatch
 

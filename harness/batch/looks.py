@@ -10,12 +10,12 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
 
 import pandas as pd
 
 from servobench.harness.batch.plan import Cell
 from servobench.harness.run.request import RunRequest
+from servobench.plant.contract.files import Record
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Looks:
     ends: tuple[int, ...]  # number of runs up to each look, the last one that of all runs
     goes_on: Callable[[pd.DataFrame], Callable[[RunRequest], bool]]
     """returns from the table of the runs so far, which may be empty, whether a run is still needed"""
-    record: dict[str, Any]
+    record: Record
     """entry `until_decided` of the manifest: what is asked"""
 
 

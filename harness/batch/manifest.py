@@ -21,12 +21,13 @@ from servobench.harness.config.registry import (
     find_plant,
 )
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
-from servobench.harness.config.settings import Section, flatten
+from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
 from servobench.harness.run.own_metrics import OwnMetric
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
-from servobench.plant.contract.files import read_toml, user_path
+from servobench.plant.contract.files import Record, read_toml, user_path
+from servobench.plant.contract.settings import Section
 from servobench.plant.robot.catalogue import find_robot, read_word
 
 PACKAGES = (
@@ -78,7 +79,7 @@ def describe_batch(
     if until_decided:
         parts.append(until_decided)
     identity = json.dumps(parts, sort_keys=True, default=str)
-    given: dict[str, dict[str, Any]] = {key: {} for key in OWN.values()}
+    given: dict[str, Record] = {key: {} for key in OWN.values()}
     for offer in own:
         given[OWN[offer.word]][offer.name] = {**metrics.get(offer.name, {}), **offer.record()}
     tuned = {offer.name: offer.tuned for offer in own if offer.tuned}
@@ -141,13 +142,13 @@ def plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
             yield name, {"place": point.value, "distribution": made, "sha256": digest}
 
 
-def describe_sensing(word: str) -> dict[str, Any]:
+def describe_sensing(word: str) -> Record:
     """Return the entry of a sensing set-up in a manifest: its features."""
     eye = find_sensing(word).setup
     return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras}
 
 
-def describe_robot(name: str) -> dict[str, Any]:
+def describe_robot(name: str) -> Record:
     """Return the entry of a robot in a manifest: the nominal arm, its source and its assumptions."""
     robot = find_robot(name)
     arm, limits, work = robot.arm, robot.limits, robot.workspace

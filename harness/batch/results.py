@@ -9,7 +9,7 @@ refused by name: `SHA256SUMS` has the checksums of all of them.
 import contextlib
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias, final
@@ -47,7 +47,7 @@ def part_name(index: int, kind: str) -> str:
     return f"{PARTS}/{index:08d}.{kind}"
 
 
-def wanted_runs(manifest: Mapping[str, Any]) -> int:
+def wanted_runs(manifest: Manifest) -> int:
     """Return the number of runs of a batch, or of those that decided it; 0 where its manifest does not tell."""
     decided = manifest.get("until_decided", {}).get("runs")
     return int(decided or manifest.get("run_count", 0))

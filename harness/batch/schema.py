@@ -7,8 +7,9 @@ from typing import Any, TypeAlias
 from servobench.harness.batch.tables import DamagedFile
 from servobench.harness.config.description import plain
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import Record
 
-Manifest: TypeAlias = dict[str, Any]  # its entries by name
+Manifest: TypeAlias = Record  # its entries by name
 MANIFEST = "manifest.json"
 SCHEMA_VERSION = "4"
 # Since an earlier schema

@@ -24,7 +24,7 @@ import numpy as np
 
 from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
-from servobench.harness.config.settings import Section, read_tuned
+from servobench.harness.config.settings import read_tuned
 from servobench.harness.config.source import (
     SourceFile,
     code_digest,
@@ -44,7 +44,7 @@ from servobench.plant.contract.faults import (
     configuration_errors,
 )
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import NonNegative, nested, settings, suggest
+from servobench.plant.contract.settings import NonNegative, Section, nested, settings, suggest
 from servobench.plant.contract.signals import PlantSpec
 
 NAME = re.compile(r"\w+(?:[:-]\w+)*")

@@ -19,15 +19,14 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.source import show
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import is_file, parse_toml, read_toml
-from servobench.plant.contract.settings import override, remark
+from servobench.plant.contract.files import Record, is_file, parse_toml, read_toml
+from servobench.plant.contract.settings import Section, override, remark
 
-Section: TypeAlias = Mapping[str, Any]  # settings by nested or dotted keys
 Config = TypeVar("Config")
 TUNING = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 TUNING_WORDS = f"{TUNING.start}:{TUNING.stop}"
@@ -129,7 +128,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
     return Settings(sections, tuple(assigned.values()), frozenset(filed - assigned.keys()))
 
 
-def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass
+def flatten(config: Any, prefix: str = "") -> Record:  # noqa: ANN401 - any configuration dataclass
     """Return the fields of a configuration dataclass, or settings by nested keys, by dotted key."""
     flat = {}
     values = (
@@ -145,16 +144,16 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - 
     return flat
 
 
-def nest(flat: Section) -> dict[str, Any]:
+def nest(flat: Section) -> Record:
     """Return settings by nested keys, given those by dotted key; None, a setting without a value, is left out."""
-    nested: dict[str, Any] = {}
+    nested: Record = {}
     for key, value in flat.items():
         if value is not None:
             _put(nested, key, value)
     return nested
 
 
-def _put(nested: dict[str, Any], key: str, value: object) -> None:
+def _put(nested: Record, key: str, value: object) -> None:
     """Write a value under a dotted key."""
     *path, name = key.split(".")
     for part in path:
@@ -162,7 +161,7 @@ def _put(nested: dict[str, Any], key: str, value: object) -> None:
     nested[name] = value
 
 
-def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
+def _assign(sections: Record, assignment: str) -> Assignment:
     mapped = MAPPED.fullmatch(assignment)
     rest = mapped[2] if mapped else assignment
     key, equals, text = rest.partition("=")

@@ -22,6 +22,7 @@ from servobench.harness.config.registry import DECLARED, Registry
 from servobench.harness.run.metrics import BUILT_IN, Metric, Summary
 from servobench.harness.run.result import Ending, WrongAnswer, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.files import Record
 from servobench.plant.contract.settings import NonNegative, settings
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class OwnMetric:
             raise WrongAnswer(f"{wanted}, got {given}", self.function)
         return float(given)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Record:
         """Return its declaration for the manifest of a results folder."""
         code = {"function": self.function.__qualname__, "summary": self.summary}
         return {**code, **asdict(self.declared)}

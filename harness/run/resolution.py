@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from servobench.harness.config import registry
-from servobench.harness.config.settings import Section, Settings, default_config, flatten, nest
+from servobench.harness.config.settings import Settings, default_config, flatten, nest
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.harness.run.variations import ROLES, Varied
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.settings import listed, override, remark, suggest
+from servobench.plant.contract.files import Record
+from servobench.plant.contract.settings import Section, listed, override, remark, suggest
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, ROBOTS, find_robot
 from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
@@ -163,7 +164,7 @@ def _may_probe(controller: str, settings: Settings) -> bool:
     )
 
 
-def _probe(defaults: dict[str, Any], plants: list[str], controllers: list[str]) -> None:
+def _probe(defaults: Record, plants: list[str], controllers: list[str]) -> None:
     """Let controllers find their first Jacobian by moves, without the posture aid, which takes a better one."""
     for name in controllers:
         defaults[name] = override(

@@ -4,13 +4,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.files import Record, read_toml
 from servobench.plant.contract.settings import with_tuples
 
 DATA = Path(str(files("servobench.plant") / "data"))
 
 
-def read_beside(module: str, name: str) -> dict[str, Any]:
+def read_beside(module: str, name: str) -> Record:
     """Return the content of a TOML file that lies beside a module, given the module's `__file__`."""
     return read_toml("facts", Path(module).with_name(name))
 

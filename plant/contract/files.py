@@ -46,6 +46,7 @@ PARTIAL = re.compile(r"\..+-\d+-\d+")
 
 Write: TypeAlias = Callable[[Path], object]  # makes a file or a folder at a path
 Read = TypeVar("Read")
+Record: TypeAlias = dict[str, Any]  # values by name: of TOML or YAML a table, of JSON an object
 Changes: TypeAlias = dict[Path, int]  # when files were changed [ns]; 0 for one that is not there
 
 # Changes of the files that the function which is called by `kept_while_unchanged` has read
@@ -197,7 +198,7 @@ def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not
     write_atomically(path, lambda partial: safe.to_csv(partial, index=False))
 
 
-def read_toml(kind: str, path: Path) -> dict[str, Any]:
+def read_toml(kind: str, path: Path) -> Record:
     """Return the content of a TOML file.
 
     Args:
@@ -231,7 +232,7 @@ def yaml_loader() -> Any:  # noqa: ANN401 - a class of PyYAML's, which is not im
     return Loader
 
 
-def parse_toml(text: str) -> dict[str, Any]:
+def parse_toml(text: str) -> Record:
     """Return the content of a text in TOML.
 
     Time and memory of the parser grow with the square of the parts of a key, and each part has tables of its own. A

@@ -162,6 +162,9 @@ File: TypeAlias = Annotated[
 ]
 """The path of a file."""
 
+Section: TypeAlias = Mapping[str, Any]
+"""Values of settings by nested or dotted keys."""
+
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
@@ -223,7 +226,7 @@ def nested(kind: type[Any]) -> Any:  # noqa: ANN401 - the default of a field of 
     return field(default_factory=kind)
 
 
-def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
+def override(name: str, default: Config, values: Section) -> Config:
     """Return the dataclass `default` with nested `values`, as TOML gives them, in place of its own.
 
     Args:

@@ -5,7 +5,6 @@ VINS (camodocal), where the fisheye's k₁ … k₄ are k2 … k5, and those of 
 """
 
 import re
-from collections.abc import Mapping
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 
 from servobench.plant.contract.facts import read_facts
 from servobench.plant.contract.faults import one_line
-from servobench.plant.contract.files import read_text, yaml_loader
+from servobench.plant.contract.files import Record, read_text, yaml_loader
 from servobench.plant.contract.settings import remark
 
 FACTS = read_facts("cameras")
@@ -32,7 +31,7 @@ def plain_name(text: str) -> str:
     return re.sub(r"[\W_]+", "", text.lower())
 
 
-def read_intrinsics(path: Path) -> dict[str, Any]:
+def read_intrinsics(path: Path) -> Record:
     """Return size, matrix and distortion of a file, by the keys of `CameraFile`.
 
     Raises:
@@ -65,9 +64,9 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     return keys | {"matrix": in_rows(keys["matrix"])}
 
 
-def _known_keys(path: Path, found: Mapping[str, Any]) -> dict[str, Any]:
+def _known_keys(path: Path, found: Record) -> Record:
     """Return the values that a file has under one of the `NAMES` of a key, by the keys of `CameraFile`."""
-    keys = dict[str, Any]()
+    keys = Record()
     for key, names in NAMES.items():
         given = {name: _data(found[name]) for name in names if name in found}
         for name, value in given.items():
@@ -126,7 +125,7 @@ def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:
     return found[cameras[0]]
 
 
-def _flat(found: dict[Any, Any]) -> dict[str, Any]:
+def _flat(found: dict[Any, Any]) -> Record:
     """Return keys with those of VINS, kalibr and ORB-SLAM under the names of ROS, where a file has them."""
     keys = {str(name): value for name, value in found.items()}
     for name, value in list(keys.items()):
@@ -153,7 +152,7 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
     return keys
 
 
-def _distortions(found: Mapping[str, Any]) -> list[str]:
+def _distortions(found: Record) -> list[str]:
     """Return the names of keys, also in a section, that may hold a distortion and are not known."""
     known = (*NAMES["distortion_model"], *PARTS)
     names = list[str]()
@@ -183,7 +182,7 @@ def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
     return value
 
 
-def _check_part(path: Path, found: Mapping[str, Any], keys: Mapping[str, Any]) -> None:
+def _check_part(path: Path, found: Record, keys: Record) -> None:
     """Refuse a message of ROS about a part of a larger image."""
     roi = found.get("roi")
     if not isinstance(roi, dict):

@@ -8,11 +8,11 @@ of the camera are those of the run's mismatch. Controllers know the joint limits
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from servobench.plant.contract.files import (
     user_path,
 )
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.settings import Section, suggest
 from servobench.plant.robot.arm import SerialArm, arm_from_dh, narrow_limits
 from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
@@ -193,7 +193,7 @@ def _read(text: str) -> Robot:
     return files.read_dh_robot(path, values)
 
 
-def _read_twin_robot(path: Path, values: Mapping[str, Any]) -> Robot:
+def _read_twin_robot(path: Path, values: Section) -> Robot:
     """Return the robot of a twin's file with its content; files that it names are beside it or where they say."""
 
     def locate(file: str) -> str:

@@ -16,11 +16,10 @@ A DH table:
 may have one entry more, which leads to the flange.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import pi
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -31,6 +30,7 @@ from servobench.plant.contract.settings import (
     JointSpeed,
     Number,
     Positive,
+    Section,
     Usual,
     override,
     remark,
@@ -99,7 +99,7 @@ class DhTable:
 REQUIRED = ("a", "d", "alpha", "joint_lower", "joint_upper", "joint_speed")
 
 
-def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
+def read_dh_robot(path: Path, values: Section) -> Robot:
     """Return the robot of a DH table with the content of a file.
 
     Raises:

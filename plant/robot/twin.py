@@ -22,11 +22,13 @@ from typing import Any
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.files import Record
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import (
     NonNegative,
     Number,
     Rows,
+    Section,
     ShareBelowOne,
     did_you_mean,
     nested,
@@ -169,7 +171,7 @@ class Twin:
                 times[key] = max(0, round(1e3 * drawn[name])) / 1e3
         return times
 
-    def plant_settings(self, config: Any, period: float) -> dict[str, Any]:  # noqa: ANN401 - of any plant
+    def plant_settings(self, config: Any, period: float) -> Record:  # noqa: ANN401 - of any plant
         """Return the settings of the mean, nested, of a plant with a configuration and a control `period` [s]."""
         keys = self.keys
         times = self.times(0)
@@ -180,7 +182,7 @@ class Twin:
         known = {each.name for each in fields(config)}
         return {name: value for name, value in given.items() if name in known}
 
-    def _sensing_settings(self, period: float) -> dict[str, Any]:
+    def _sensing_settings(self, period: float) -> Record:
         """Return losses, noise and rate of the camera as settings of a sensor, for a control `period` [s]."""
         keys = self.keys
 
@@ -190,7 +192,7 @@ class Twin:
                 return size
             return f"{size}px"
 
-        sensing: dict[str, Any] = {
+        sensing: Record = {
             "drop_probability": keys.lost_frames,
             "outliers": keys.outliers,
         }
@@ -207,7 +209,7 @@ class Twin:
         return sensing
 
 
-def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
+def read_twin(path: Path, values: Section, arm: SerialArm) -> Twin:
     """Return the twin with the content of a file, given the nominal arm of its robot.
 
     Raises:

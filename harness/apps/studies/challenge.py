@@ -23,7 +23,7 @@ from dataclasses import field, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
@@ -36,7 +36,7 @@ from servobench.harness.run.sampling import draw
 from servobench.harness.run.tasks import choose_task
 from servobench.harness.run.variations import SHORT_NAMES
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import read_toml, user_path
+from servobench.plant.contract.files import Record, read_toml, user_path
 from servobench.plant.contract.settings import (
     Count,
     Names,
@@ -103,7 +103,7 @@ class Challenge:
     period: Positive | None = None
     latency: NonNegative | None = None
     noise: NonNegative | None = None
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Record = field(default_factory=dict)
     reference_seeds: Count | None = None
     grade: Grade = nested(Grade)
 

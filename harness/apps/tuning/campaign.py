@@ -45,10 +45,10 @@ from servobench.harness.batch.lock import LOCK
 from servobench.harness.config.description import toml
 from servobench.harness.config.installation import read_checkout
 from servobench.harness.config.registry import offered
-from servobench.harness.config.settings import Section, default_config, file_stem, flatten
+from servobench.harness.config.settings import default_config, file_stem, flatten
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, write_text
-from servobench.plant.contract.settings import Count, Periods, settings
+from servobench.plant.contract.settings import Count, Periods, Section, settings
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
 
@@ -329,7 +329,7 @@ def write_tuned(path: Path, tuned: TunedValues) -> None:
         write_text(path, text)
 
 
-def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
+def _table(values: Section, before: str = "", heading: str = "") -> str:
     """Return a table in TOML, those in it after its own values; `before` stands before their names."""
     lines = ""
     tables = ""

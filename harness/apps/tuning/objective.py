@@ -41,7 +41,6 @@ from servobench.harness.batch.plan import Cell, Survey, tuning_seeds
 from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import (
     TUNING,
-    Section,
     Settings,
     apply_settings,
     file_stem,
@@ -57,7 +56,7 @@ from servobench.plant.contract.faults import ConfigurationError, RunFault, confi
 from servobench.plant.contract.files import accessing
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Count, Periods, settings
+from servobench.plant.contract.settings import Count, Periods, Section, settings
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
@@ -402,7 +401,7 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
     return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint)
 
 
-def _written(values: Mapping[str, Any]) -> dict[str, str]:
+def _written(values: Section) -> dict[str, str]:
     """Return values as texts that tell any two of them apart."""
     return {key: repr(value) for key, value in values.items()}
 

@@ -38,7 +38,6 @@ from servobench.controllers.aids import RANGES, SWITCHES, Switch, Tuned
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import choose_controller, find_controller, offered
 from servobench.harness.config.settings import (
-    Section,
     apply_settings,
     flatten,
     nest,
@@ -47,8 +46,9 @@ from servobench.harness.config.settings import (
 from servobench.plant.contract.dependence import declared
 from servobench.plant.contract.facts import read_beside
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.files import Record
 from servobench.plant.contract.seeds import named_seed
-from servobench.plant.contract.settings import check_field, suggest
+from servobench.plant.contract.settings import Section, check_field, suggest
 
 Distribution: TypeAlias = CategoricalDistribution | FloatDistribution | IntDistribution
 Space: TypeAlias = Mapping[str, Distribution]
@@ -246,7 +246,7 @@ def values_of(name: str, config: Any) -> Point:  # noqa: ANN401 - any configurat
     return {key: flat[key] for key in find_space(name)}
 
 
-def nested_settings(values: Point) -> dict[str, Any]:
+def nested_settings(values: Point) -> Record:
     """Return the nested settings of a point of a search space, numbers rounded to three digits."""
     rounded = {
         key: float(f"{each:.{DIGITS}g}") if isinstance(each, float) else each
