@@ -637,11 +637,11 @@ def errors_along(log: Log, model: RobotModel, robot: Identified) -> tuple[Any, F
 def _check_sensing(model: RobotModel) -> None:
     """Refuse a model whose camera cannot be identified."""
     sensing = POSITION.name
-    fixed = True
     if isinstance(model, SetupModel):
         sensing = model.setup.name
-        fixed = model.mount == "fixed"
-    if sensing not in (POSITION.name, PIXEL.name) or not fixed:
+        if model.mount != "fixed":
+            sensing += f":{model.mount}"
+    if sensing not in (POSITION.name, PIXEL.name):
         wanted = "logs with --sensing position or pixel, of a fixed camera"
         raise ConfigurationError(f"identify takes {wanted}; got {sensing}")
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servobench.harness.apps.twin.drive import MIN_MOTION
 from servobench.harness.apps.twin.identification import OUTLIER, Identified, fit_cameras, identify
 from servobench.harness.apps.twin.log import MIN_FRAMES, Log, frames_of
 from servobench.harness.apps.twin.search import searched
@@ -68,7 +69,7 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         others: returns the nominal models of other arms by name; called for a log with a mistake.
     """
     jump, _ = log.first_jump()
-    found = log.joint_mistake() or jump or _units(log, model) or log.frame_mistake()
+    found = log.joint_mistake() or jump or _rest(log) or _units(log, model) or log.frame_mistake()
     if found:
         return found, None
     robot = identify(log, model)
@@ -156,6 +157,14 @@ def _shares(log: Log, robot: Identified) -> FloatArray:
     """Return the errors of a feature over its motion, (m,)."""
     motion = np.std(log.features[robot.rows], axis=0).max()
     return np.sqrt(np.diag(robot.noise)) / motion
+
+
+def _rest(log: Log) -> str:
+    """Name an arm at rest, to whose noise parameters would be fitted."""
+    motion = np.ptp(log.joints[frames_of(log)], axis=0).max()
+    if motion >= MIN_MOTION:
+        return ""
+    return f"no joint moves by more than {motion:.2g} rad, which tells nothing of an arm: lead it through its region"
 
 
 def _units(log: Log, model: RobotModel) -> str:

@@ -443,14 +443,16 @@ def test_a_short_move_and_a_long_rest_are_no_mistake_and_tell_no_parameter(contr
         assert f"likely in {unit}; write them in m" in mistakes(moved, model)[0]
 
 
-def test_an_arm_that_does_not_move_is_no_mistake():
+@pytest.mark.parametrize(("drift", "motion"), [(0.0, "0 rad"), (0.004, "0.0039 rad")])
+def test_no_robot_is_fitted_to_the_noise_of_an_arm_at_rest(drift, motion):
     log, _, model = logged()
     rng = np.random.default_rng(5)
     features = log.features[:1] + rng.normal(0.0, 1e-3, log.features.shape)
-    still = log._replace(joints=np.tile(log.joints[:1], (len(log.joints), 1)), features=features)
+    creep = np.linspace(0.0, drift, len(log.joints))[:, None]
+    still = log._replace(joints=log.joints[:1] + creep, features=features)
     text, robot = mistakes(still, model)
-    assert text == ""
-    assert estimates(robot, None).empty
+    assert robot is None
+    assert text.startswith(f"no joint moves by more than {motion}")
 
 
 @pytest.mark.parametrize("pixel", [0.01, 0.02])
