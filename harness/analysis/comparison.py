@@ -385,9 +385,14 @@ def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
     return texts_of(runs, name).astype(float)
 
 
+def completed(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+    """Return a column of numbers of the table of runs, NaN where a run did not complete."""
+    return column_of(runs, name).where(runs["status"] == COMPLETED)
+
+
 def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
     """Return the settling time of each run, s; NaN where it never settled or did not complete."""
-    return column_of(runs, "settling_time_s").where(runs["status"] == COMPLETED)
+    return completed(runs, "settling_time_s")
 
 
 def settled_share(runs: pd.DataFrame) -> Estimate:
@@ -552,7 +557,7 @@ def _paired_values(
     runs: pd.DataFrame, pair: Pair, metric: str, keys: Sequence[str]
 ) -> tuple[pd.Series[float], pd.Series[float]]:
     """Return the values of two controllers on the runs that they share, by the keys of these; NaN of lost ones."""
-    values = direction(metric) * column_of(runs, metric).where(runs["status"] == COMPLETED)
+    values = direction(metric) * completed(runs, metric)
     index = pd.MultiIndex.from_frame(runs[list(keys)])
     indexed = pd.Series(values.to_numpy(), index=index)
     first = indexed[(runs["controller"] == pair[0]).to_numpy()]

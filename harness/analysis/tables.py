@@ -30,6 +30,7 @@ from servobench.harness.analysis.comparison import (
     achievement,
     column_of,
     compare_pairs,
+    completed,
     direction,
     grouped,
     holm,
@@ -227,12 +228,24 @@ def judge_places(runs: pd.DataFrame, selection: Selection | None = None) -> Stat
     """
     known = list(runs["controller"].unique())
     shown = selection or Selection({name: name for name in known})
+    conditions = split_conditions(runs)
+    metric = shown.metric
+    filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
+    numbers = {*filled, *(judged_metric(place) for _, place in conditions)} & set(runs) - {"seed"}
+    if metric is not None and metric not in numbers:
+        raise ConfigurationError(
+            f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}"
+        )
     places = []
     verdicts = 0
-    for words, place in split_conditions(runs):
+    for words, place in conditions:
         verdicts += len(_pairs(place, known))
         places.append(JudgedPlace(words, _controller_rows(place, shown), *_pair_rows(place, shown)))
     pairs = [row for place in places for row in place.pairs]
+    if metric is not None and not pairs:
+        raise ConfigurationError(
+            f"no two controllers have runs of one seed to compare; leave --metric {metric} out"
+        )
     p_values = [cast("float", row[P_VALUE].value) for row in pairs]
     for row, p_value, corrected in zip(pairs, p_values, holm(p_values), strict=True):
         row[P_VALUE] = Cell(PValue(p_value, corrected), ".3f")
@@ -243,7 +256,8 @@ def _controller_rows(runs: pd.DataFrame, selection: Selection) -> list[Row]:
     """Return how each controller of a place does: good runs, medians, the worst runs and the failures."""
     heading = {name: metric_heading(name, runs) for name in METRICS}
     is_curve = achievement(runs) == FOLLOWED
-    judged = "rms_error_evaluated" if is_curve else "steady_state_error"
+    metric = judged_metric(runs)
+    judged = metric if is_curve else "steady_state_error"
     unit_of_error = heading[judged].rpartition(" ")[2]
     _, factor = shown_unit(judged, runs)
     rows = []
@@ -253,12 +267,12 @@ def _controller_rows(runs: pd.DataFrame, selection: Selection) -> list[Row]:
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
         failures = ", ".join(f"{count} {kind}" for kind, count in failed.items())
-        error = factor * column_of(own, judged).where(own["status"] == COMPLETED)
+        error = factor * completed(own, judged)
         row = {"controller": Cell(selection.names[name]), "runs": Cell(len(own))}
         row[f"{achievement(runs)} [%]"] = Cell(achieved_share(own), ".1f")
         if not is_curve:
             overshoot = 100.0 * column_of(own, "overshoot")
-            row[heading["settling_time_s"]] = Cell(_median(settling_times(own)), ".2f")
+            row[heading[metric]] = Cell(_median(completed(own, metric)), ".2f")
             row[heading["overshoot"]] = Cell(_median(overshoot), ".1f")
         row[heading[judged]] = Cell(_median(error), ".1f")
         row[f"its worst 5 % {unit_of_error}"] = Cell(tail_mean(error), ".1f")
@@ -280,19 +294,12 @@ def _pairs(runs: pd.DataFrame, names: Iterable[str], against: str | None = None)
 def _pair_rows(runs: pd.DataFrame, selection: Selection) -> tuple[list[Row], str, str, str, int]:
     """Return a row for each pair of a place that is shown, and what a `JudgedPlace` says of all of them."""
     pairs = _pairs(runs, selection.names, selection.against)
-    metric = selection.metric or judged_metric(runs)
-    if not pairs and selection.metric is None:
+    judged = judged_metric(runs)
+    metric = selection.metric or judged
+    # Overshoot, say, is no measure of a curve
+    applies = metric == judged or column_of(runs, metric).notna().any()
+    if not pairs or not applies:
         return [], "", "", "", 0
-    if not pairs:
-        raise ConfigurationError(
-            f"no two controllers have runs of one seed to compare; leave --metric {metric} out"
-        )
-    filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
-    numbers = {judged_metric(runs), *map(str, filled)} & set(runs) - {"seed"}
-    if metric not in numbers:
-        raise ConfigurationError(
-            f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}"
-        )
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
     unit, factor, digits = "1", 1.0, 2  # a column that is no metric
     heading = metric.replace("_", " ")

@@ -18,11 +18,12 @@ import pandas as pd
 
 from servobench.harness.analysis.comparison import (
     MIN_PAIRS,
+    SEQUENCE,
     Difference,
     PageRow,
     achieved_share,
     achievement,
-    column_of,
+    completed,
     grouped,
     is_majority,
     knows_truth,
@@ -35,6 +36,7 @@ from servobench.harness.analysis.comparison import (
     shown_unit,
     split_conditions,
     split_tasks,
+    texts_of,
 )
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED
@@ -106,6 +108,8 @@ def judged_metric(place: pd.DataFrame) -> str:
     """Return the column by which the runs of a place are compared."""
     if achievement(place) == FOLLOWED:
         return "rms_error_evaluated"
+    if (texts_of(place, "task_kind") == SEQUENCE).any():
+        return "settling_time_later_s"
     return "settling_time_s"
 
 
@@ -122,8 +126,7 @@ def judged_column(runs: pd.DataFrame) -> pd.Series[float]:
     """Return the judged metric of each run in the unit in which it is shown; infinite where the run is lost."""
     metric = judged_metric(runs)
     _, factor = shown_unit(metric, runs)
-    completed = column_of(runs, metric).where(runs["status"] == COMPLETED)
-    return (factor * completed).fillna(np.inf)
+    return (factor * completed(runs, metric)).fillna(np.inf)
 
 
 def _of_one_run(runs: pd.DataFrame) -> str:

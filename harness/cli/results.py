@@ -43,7 +43,7 @@ def statistics(
         option(
             "COLUMN",
             "Column of the table of runs by which pairs are compared, or a metric of yours, ./mine.py:itae; default: "
-            "settling time, on curves RMS error.",
+            "settling time, in sequences of later moves, on curves RMS error.",
         ),
     ] = None,
     controllers: ShownOption = "all",

@@ -4,8 +4,8 @@
     def itae(steps):
         return np.trapezoid(steps["time_s"] * steps["error_norm"], steps["time_s"])
 
-The function gets the table of steps of one run, with at least one row, and returns a number, NaN where it does not
-apply. It is called in the process of the run.
+The function gets the table of steps of one run, with at least one row, and returns a number. NaN is none: such a run is
+left out of medians, and lost in a comparison of pairs. It is called in the process of the run.
 """
 
 from __future__ import annotations

@@ -98,6 +98,23 @@ def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     assert row["verdict"] == "better"
 
 
+def test_a_measure_of_moves_is_compared_where_there_are_moves(runs):
+    curve = runs.assign(task="circle", task_kind="curve", overshoot=np.nan)
+    both = pd.concat([runs, curve]).assign(status="completed")
+    move, circle = judge_places(both, choosing(runs, metric="overshoot")).places
+    assert [row["verdict"].value for row in move.pairs] == ["equivalent"]
+    assert (len(circle.controllers), circle.pairs) == (2, [])
+
+
+def test_sequences_are_judged_by_their_later_moves_as_in_the_suite(runs):
+    later = np.where(runs["controller"] == "quick", 1.5, 1.0)
+    tour = runs.assign(task_kind="sequence", settling_time_later_s=later, status="completed")
+    assert set(judge_controllers(tour)["later moves [s]"].str[:4]) == {"1.50", "1.00"}
+    (row,) = compare_controllers(tour).to_dict("records")
+    assert row["mean difference in later moves [s]"] == "0.50 [0.50, 0.50]"
+    assert (row["runs lost"], row["verdict"]) == ("0 : 0", "worse")
+
+
 def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
     late = runs.assign(
         settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0)

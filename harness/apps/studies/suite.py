@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import (
     column_of,
+    completed,
     margin,
     median_with_interval,
     outcomes,
@@ -48,7 +49,6 @@ from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.request import UNFIT_FOR_FILES
 from servobench.harness.run.resolution import check_settings, resolve_sections, select
-from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.files import write_csv
 
 MAX_REFERENCE_LOSS = 0.05
@@ -167,7 +167,7 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
     """
     measure = MEASURES[challenge.measure]
     floor = measure.factor * measure.floor
-    measured = measure.factor * column_of(runs, measure.column).where(runs["status"] == COMPLETED)
+    measured = measure.factor * completed(runs, measure.column)
     value = measured
     if measure.whole:
         value = measured.where(outcomes(runs).isin(ACHIEVED))
