@@ -17,7 +17,7 @@ from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sect
 from servobench.harness.run.variations import Row, varied_in_row
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import TIME, numbers_of, read_table
+from servobench.plant.contract.files import TIME, numbers_of, read_table, user_path
 from servobench.plant.contract.settings import remark, suggest
 from servobench.plant.robot.mismatch import Mismatch
 
@@ -86,6 +86,8 @@ def logged_in_folder(
             that cannot be made ready here.
     """
     row = find_run(folder, run_id)
+    if row["task"] in folder.manifest.get("own_tasks", {}) or _place_of_files(folder):
+        row["task"] = TASK  # as the reference is logged, no code and no file is needed for it
     run = run_in_folder(folder, row, controller, {"sensing": sensing})
     steps = folder.steps([row["run_id"]])
     if steps.empty:
@@ -111,14 +113,14 @@ def run_in_folder(
     """
     manifest = folder.manifest
     known = named or {}
-    for word in ("plant", "sensing", *([] if controller else ["controller"])):
+    for word in ("plant", "task", "sensing", *([] if controller else ["controller"])):
         name = str(row.get(word, ""))
         # Code of users may have any name.
         place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")
         if name != known.get(word) and (place or CODE.search(name)):
             remedy = (
                 "nothing that a folder names is run"
-                if word == "plant"
+                if word in ("plant", "task")
                 else f"name it by --{word} if you trust it"
             )
             raise ConfigurationError(
@@ -134,7 +136,16 @@ def run_in_folder(
     request = RunRequest(
         controller=controller or row["controller"], seed=int(row["seed"]), varied=varied, **asked
     )
-    return resolve(request, _settings_of(request, manifest, own=not controller))
+    with configuration_errors(_place_of_files(folder)):
+        return resolve(request, _settings_of(request, manifest, own=not controller))
+
+
+def _place_of_files(folder: ResultsFolder) -> str:
+    """Return the beginning of an error where a folder names a file from elsewhere; empty where all are there."""
+    for name in folder.manifest.get("files", {}):
+        if not user_path(name).is_file():
+            return f"{folder.path} was made where {name} is; run this there: "
+    return ""
 
 
 def _settings_of(request: RunRequest, manifest: Manifest, *, own: bool) -> Settings:
@@ -195,7 +206,8 @@ def _period(path: Path, table: pd.DataFrame) -> float:
     """Return the control period [s] of a log, the mean distance of its rows; refuse rows at other distances."""
     times = numbers_of(f"log {path}", table, [TIME])[:, 0]
     steps = np.diff(times)
-    usual = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0
+    gaps = np.diff(np.sort(times))
+    usual = float(np.median(gaps[gaps > 0.0])) if gaps.any() else 0.0
     if not 0.0 < usual <= MAX_PERIOD:
         units = [
             f"{unit}: divide it by {count:g}"

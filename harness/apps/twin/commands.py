@@ -272,7 +272,8 @@ def _logged(
     if log.is_dir():
         resolved, table = logged_in_folder(ResultsFolder(log), run, controller, named[1])
         for word, given, usual in (("robot", named[0], "ur5"), ("sensing", named[1], "position")):
-            if given not in (usual, own := getattr(resolved.request, word)):
+            own = getattr(resolved.request, word)
+            if given != usual and Path(given) != Path(own):
                 raise ConfigurationError(
                     f"--{word} {given} is not that of the run, {own}; leave it out for a folder"
                 )

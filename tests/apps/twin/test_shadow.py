@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,8 @@ import pytest
 
 from kit.broken_controllers import stepping
 from kit.command import servobench
+from kit.documents import blocks
+from kit.robots import FOUR_JOINTS
 from servobench import compare, run
 from servobench.harness.apps.twin.predictions import predictions
 from servobench.harness.apps.twin.shadow import COMMAND, LOGGED, differences, shadow
@@ -168,6 +171,34 @@ def test_a_folder_does_not_run_the_users_code_that_it_names(refusal_of, tmp_path
         assert servobench(monkeypatch, "shadow", str(out), "--controller", f"position={place}") == 0
 
 
+def test_a_log_of_a_task_of_the_users_is_shown_without_its_code(own_folder, tmp_path):
+    page = (Path(__file__).parents[3] / "docs/tasks.md").read_text(encoding="utf-8")
+    (spiral,) = (block for block in blocks(page, "python") if "class Spiral" in block)
+    (tmp_path / "spiral.py").write_text(spiral, encoding="utf-8")
+    compare(["ukf_mfac"], tasks=["./spiral.py"], settings={"Spiral": {"duration": 3.0}}, out="out")
+    (tmp_path / "spiral.py").unlink()
+    resolved, steps = logged_in_folder(ResultsFolder(tmp_path / "out"), None, None)
+    seen = shadow(resolved, steps)
+    followed = len(steps) - round(resolved.run.preview_time / resolved.run.period)
+    np.testing.assert_array_equal(commands(seen)[:followed], commands(steps)[:followed])
+
+
+def test_a_folder_names_its_files_from_where_it_was_made(
+    own_folder, output_of, refusal_of, tmp_path, monkeypatch
+):
+    way = "time_s,x_m,y_m,z_m\n0,0,0,1.25\n3,0.05,0,1.25\n"
+    (tmp_path / "way.csv").write_text(way, encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(FOUR_JOINTS, encoding="utf-8")
+    asked = ("run", "ukf_mfac", "--plant", "kinematic", "--no-figures", "--out")
+    output_of(*asked, "way", "--task", "waypoints", "--set", "waypoints.file=way.csv")
+    output_of(*asked, "arm", "--task", "random", "--robot", "arm.toml")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert "Features one frame ahead" in output_of("shadow", "../way")
+    line = refusal_of("shadow", "../arm")
+    assert "../arm was made where arm.toml is; run this there: robot file arm.toml" in line
+
+
 def test_another_controller_sees_the_log_whatever_it_commands(folder, steps, tmp_path, monkeypatch):
     (tmp_path / "proportional.py").write_text(PROPORTIONAL, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
@@ -236,6 +267,8 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(
         (lambda table: table.loc[table.index.repeat(2)],
          "row 1 is 0 s after the row before, .* leave out doubled ones"),
         (lambda table: table.iloc[::-1], "row 1 is -0.05 s after the row before"),
+        (lambda table: table.assign(time_s=4.0 * table["time_s"]).sample(frac=1.0, random_state=1),
+         "and rows must be the control period of .* s apart: sort them"),
         (lambda table: table.assign(time_s=table["time_s"] + 0.003 * (table.index == 7)),
          "row 7 is 0.053 s after the row before, and stamps are up to 2.9 ms off equal steps of 0.05 s: if the rows"),
         (lambda table: table.assign(time_s=table["time_s"] + 0.003 * (-1.0) ** table.index),
