@@ -296,6 +296,9 @@ def _carry_out(
     from servobench.harness.config.installation import missing_extra
 
     folder = out or new_folder()
+    if question is not None and how.part != (1, 1):
+        question = None
+        say("parts decide nothing: merge them, and decide by the same call with --resume")
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
         opened = ResultsFolder(folder)

@@ -36,8 +36,10 @@ def find_code(given: str) -> Code:
     if found is not None and found["file"]:
         text = found["file"]
     file = user_path(text).absolute()
-    if not file.is_file() or file.suffix not in (".py", WHEEL):
-        raise ConfigurationError(f"there is no file {given}, wanted code in a file .py or a wheel")
+    if file.suffix not in (".py", WHEEL):
+        raise ConfigurationError(f"{given} is no code: wanted a file .py, or a wheel")
+    if not file.is_file():
+        raise ConfigurationError(f"there is no file {given}")
     if file.suffix == WHEEL:
         folder = _unpack(file)
         return Code(_published(folder, file), file, folder)

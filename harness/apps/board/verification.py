@@ -15,7 +15,7 @@ from servobench.harness.batch.consistency import find_contradiction
 from servobench.harness.batch.fingerprint import fingerprint
 from servobench.harness.batch.logs import run_in_folder
 from servobench.harness.batch.results import ResultsFolder, of_one_run
-from servobench.harness.config.registry import is_foreign_controller
+from servobench.harness.config.registry import FILES, is_foreign_controller
 from servobench.harness.run.episode import carry_out
 from servobench.harness.run.request import RunSettings
 from servobench.harness.run.result import COMPLETED, OUT_OF_MEMORY, TIMED_OUT, RunResult
@@ -182,6 +182,8 @@ def _carry_out(folder: ResultsFolder, row: Row, code: Code | None) -> tuple[RunR
     if code is not None:
         return carry_out_apart(folder, row, code)
     name = row["controller"]
+    if name.startswith(FILES):
+        raise ConfigurationError(f"{name} is no code, which alone is carried out again")
     if is_foreign_controller(name):
         raise ConfigurationError(f"name its controller by --controller {name}=FILE")
     return carry_out(run_in_folder(folder, row, None)), []

@@ -193,7 +193,7 @@ def test_a_link_in_a_pack_is_not_followed(copied):
         ("calibrated", ["mounting"], "knows the true robot: it is a ceiling"),
         ("ukf_mfac", ["mountain"], "unknown 'mountain'"),
         ("./absent.py", ["mounting"], "there is no file ./absent.py"),
-        ("collections:Counter", ["mounting"], "wanted code in a file .py or a wheel"),
+        ("collections:Counter", ["mounting"], "is no code: wanted a file .py, or a wheel"),
         ("./broken.whl", ["mounting"], "is no wheel"),
     ],
 )

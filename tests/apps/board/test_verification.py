@@ -1,6 +1,7 @@
 """Runs that are carried out again: honest ones recur, and code that knew more than its observations is named."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -273,10 +274,18 @@ def test_the_drawn_runs_are_those_of_the_table():
     assert len(others) > 1
 
 
-@pytest.mark.parametrize("given", ["absent.py", "mine", "mine.txt"])
-def test_a_controller_is_a_file_or_a_wheel(tmp_path, given):
-    (tmp_path / "mine.txt").write_text("")
-    with pytest.raises(ConfigurationError, match=f"there is no file {given}"):
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("absent.py", "there is no file absent.py"),
+        ("mine", "mine is no code: wanted a file .py, or a wheel"),
+        ("mine.fmu", "mine.fmu is no code: wanted a file .py, or a wheel"),
+    ],
+)
+def test_a_controller_is_a_file_or_a_wheel(tmp_path, monkeypatch, given, told):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.fmu").write_text("")
+    with pytest.raises(ConfigurationError, match=told):
         find_code(given)
 
 
