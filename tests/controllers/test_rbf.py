@@ -139,6 +139,20 @@ def test_what_was_learned_fades_by_its_leak_per_second():
     assert np.abs(learned).max() > 1e-4
 
 
+def test_what_was_learned_is_the_jacobian_without_that_of_the_first_weights():
+    net = network()
+    run = started(RbfConfig(), net)
+    first = run.state
+    for q in np.random.default_rng(6).normal(size=(3, 3)):
+        run.update(motion(q, [0.01, 0.02]))
+        learned = run.estimator.deviation(run.state, first, q)
+        expected = net.jacobian(q, run.state.rows) - net.jacobian(q, first.rows)
+        np.testing.assert_allclose(learned, expected, rtol=1e-9, atol=1e-14)
+        assert np.abs(learned).max() > 1e-6
+        whole = run.estimator.deviation(run.state, None, q)
+        np.testing.assert_array_equal(whole, net.jacobian(q, run.state.rows))
+
+
 def test_a_kept_value_is_returned_only_for_the_same_position_and_weights():
     net = network()
     first, second = np.random.default_rng(5).normal(size=(2, 3))

@@ -118,6 +118,24 @@ def test_the_planned_cameras_see_the_target_in_the_middle_at_home(word, robot):
         np.testing.assert_allclose(model.distance, HAND_DISTANCE * arm.workspace.scale)
 
 
+def test_out_of_view_the_jacobian_is_that_of_the_last_posture_in_view_on_the_way_from_home():
+    arm = find_robot("ur5")
+    model = Sensing.parse("pixel").nominal(arm)
+    home = arm.workspace.home
+    ends = home + 2.0 * (2.0 * np.random.default_rng(0).random((20, 6)) - 1.0)
+    moved = 0
+    for q in ends:
+        way = (home + share * (q - home) for share in np.arange(20, -1, -1) / 20.0)
+        last = next(posture for posture in way if model.valid(posture).all())
+        moved += not np.array_equal(last, q)
+        found = model.valid_jacobian(q, home)
+        np.testing.assert_allclose(found, model.jacobian(last), rtol=1e-12, atol=1e-9)
+    assert 3 < moved < 17
+    np.testing.assert_array_equal(
+        model.valid_jacobian(ends, home), [model.valid_jacobian(q, home) for q in ends]
+    )
+
+
 @pytest.mark.parametrize("word", ["pixel", "stereo:hand", "plate:hand"])
 def test_a_metre_across_the_sight_changes_a_pixel_by_the_scale(word):
     model = Sensing.parse(word).nominal(find_robot("ur5"))
