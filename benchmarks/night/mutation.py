@@ -54,7 +54,8 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     ),
     "metrics": (
         ("harness/run/metrics.py",),
-        ("harness/test_metrics.py", "harness/test_metrics_oracle.py", "harness/test_page_tables.py"),
+        ("harness/test_metrics.py", "harness/test_metrics_oracle.py", "harness/test_page_tables.py",
+         "harness/test_sequences.py"),
     ),
     "statistics": (
         ("harness/analysis/comparison.py", "harness/apps/studies/scores.py"),
