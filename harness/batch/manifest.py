@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from servobench.harness.batch.fingerprint import fingerprint
 from servobench.harness.batch.plan import Survey
@@ -59,7 +58,7 @@ def describe_batch(
     own: Sequence[Offer] = (),
     *,
     steps: bool = False,
-    until_decided: Mapping[str, Any] | None = None,
+    until_decided: Record | None = None,
 ) -> Manifest:
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 

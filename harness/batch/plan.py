@@ -11,7 +11,7 @@ import math
 import re
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from textwrap import shorten
@@ -22,7 +22,7 @@ import numpy as np
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import TUNING, TUNING_WORDS
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.variations import SHORT_NAMES, Value, Varied
+from servobench.harness.run.variations import SHORT_NAMES, Row, Value, Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import parse_toml, split_words
@@ -167,7 +167,7 @@ class Cell:
     """A run and its further columns in the table of runs."""
 
     request: RunRequest
-    columns: Mapping[str, Any] = field(
+    columns: Row = field(
         default_factory=dict
     )  # such as the place along the axis that a sweep varies
     picture: bool = False  # keep the last picture of the camera
@@ -301,7 +301,7 @@ class Place:
     magnitude: Magnitude | None = None
 
     @cached_property
-    def columns(self) -> dict[str, Any]:
+    def columns(self) -> Row:
         """The columns of the table of runs that say so; empty and NaN without an axis."""
         number, unit = (
             (math.nan, "")

@@ -28,6 +28,7 @@ from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, INSTANT, Ending, RunResult, ends_batch
 from servobench.harness.run.sampling import Drawn, draw_once
+from servobench.harness.run.variations import Row
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import NamedArrays
 from servobench.plant.contract.faults import RunFault
@@ -200,12 +201,12 @@ def _row(
     }
 
 
-def identity(run: ResolvedRun) -> dict[str, Any]:
+def identity(run: ResolvedRun) -> Row:
     """Return the columns that are known of a run before it is carried out."""
     return {**wanted_columns(run), "engine": engine_of(run.request.plant)}
 
 
-def wanted_columns(run: ResolvedRun) -> dict[str, Any]:
+def wanted_columns(run: ResolvedRun) -> Row:
     """Return the columns by which a run is found, with an unusual period."""
     row = run.request.as_row()
     if run.run.period != RunSettings.period:

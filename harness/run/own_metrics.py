@@ -137,7 +137,7 @@ def values_of(
     return values, fault
 
 
-def declare_metrics(records: Mapping[str, Mapping[str, Any]]) -> None:
+def declare_metrics(records: Mapping[str, Record]) -> None:
     """Let tables, figures and verdicts know metrics of users for as long as the command takes.
 
     Args:

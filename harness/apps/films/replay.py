@@ -9,7 +9,7 @@ import math
 import re
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ import pandas as pd
 from servobench.harness.apps.figures.tracks import Track, track_of, values_drawn
 from servobench.harness.config.registry import rendered_plant
 from servobench.harness.run.request import OWN_ROBOT
+from servobench.harness.run.variations import Row
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -64,7 +65,7 @@ class LoggedRun:
     reference: FloatArray  # (k, 3) [m], base frame
 
 
-def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
+def logged_run(row: Row, steps: pd.DataFrame | None) -> LoggedRun:
     """Prepare a run to be shown.
 
     Args:
@@ -224,7 +225,7 @@ class Replay(AbstractContextManager["Replay"]):
         draw(picture, ~hidden)
 
 
-def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:
+def _true_model(row: Row, robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:
     """Return the run's true robot, and the one after its camera was moved; None if it was not.
 
     Raises:

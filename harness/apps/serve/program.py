@@ -9,13 +9,14 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any, TypeAlias, final
+from typing import TypeAlias, final
 
 import numpy as np
 
 from servobench.harness.apps.serve.wire import CONTROLLER, Say
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.files import Record
 from servobench.plant.contract.signals import PlantSpec
 
 # The date that a control script has in it
@@ -94,7 +95,7 @@ class ControlProgram:
         self._drive = drive
         self._say = say
         self._lockstep = lockstep
-        self.inputs: dict[str, Any] = {}
+        self.inputs: Record = {}
         self.stopped_at: float | None = None
         self._rest: FloatArray = np.zeros(spec.n)
         self.velocity = self.joints = self._rest
@@ -137,7 +138,7 @@ class ControlProgram:
             self.stopped_at = None
         return self.stopped_at is None
 
-    def write(self, values: dict[str, Any]) -> bool:
+    def write(self, values: Record) -> bool:
         """Write input registers, and return whether that of commands, which the watchdog waits for, is among them."""
         self.inputs |= values
         self._silence = 0 if COMMAND in values else self._silence

@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TypeAlias, final
+from typing import TypeAlias, final
 
 import cv2
 
@@ -33,7 +33,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.faults import ConfigurationError, RunFault
-from servobench.plant.contract.files import reason
+from servobench.plant.contract.files import Record, reason
 from servobench.plant.robot.catalogue import find_robot
 
 Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
@@ -111,7 +111,7 @@ class Server:
         self._fault: str | None = None
         self._sent = 0
         self._turn = asyncio.Event()
-        self.state: dict[str, Any] = {
+        self.state: Record = {
             **wire.CONTROLLER["constant"],
             "actual_digital_output_bits": 0,
         }
@@ -378,7 +378,7 @@ class Server:
                 self._advance()
             self._publish()
 
-    def _switch(self, values: dict[str, Any]) -> None:
+    def _switch(self, values: Record) -> None:
         """Set outputs of the control box and the tool."""
         for name, shift in (("standard", 0), ("configurable", 8), ("tool", 16)):
             mask = values.get(f"{name}_digital_output_mask", 0) << shift

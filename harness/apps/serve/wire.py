@@ -18,6 +18,7 @@ from itertools import islice
 from typing import Any, Self, TypeAlias
 
 from servobench.plant.contract.facts import read_beside
+from servobench.plant.contract.files import Record
 
 CONTROLLER = read_beside(__file__, "controller.toml")
 MAX_NAMES = 2048  # bytes of a list of names, by the guide
@@ -84,7 +85,7 @@ class Recipe:
         """The values on the wire, after the number of the recipe; all types have to be known."""
         return struct.Struct(">" + "".join(CODES[each] for each in self.types))
 
-    def pack(self, values: Mapping[str, Any]) -> bytes:
+    def pack(self, values: Record) -> bytes:
         """Return the values as bytes, numbers or tuples of them by name; one that is missing is zero."""
         numbers: list[Any] = []
         for name, kind in zip(self.names, self.types, strict=True):
@@ -92,7 +93,7 @@ class Recipe:
             numbers.extend(value if isinstance(value, Iterable) else (value,))
         return self.layout.pack(*numbers)
 
-    def unpack(self, body: bytes) -> dict[str, Any]:
+    def unpack(self, body: bytes) -> Record:
         """Return the value of each variable, or raise a `WireError` for another number of bytes."""
         if len(body) != self.layout.size:
             raise WireError(

@@ -53,7 +53,7 @@ from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sec
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import Row, Varied
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
-from servobench.plant.contract.files import accessing
+from servobench.plant.contract.files import Record, accessing
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, Periods, Section, settings
@@ -304,7 +304,7 @@ SHOWN = 60  # letters of wrong costs that a message holds
 class Ledger:
     """Costs by settings, each written down as soon as it is known."""
 
-    def __init__(self, path: Path, fingerprint: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, fingerprint: Record) -> None:
         """Open a ledger, or prepare one where there is none; its file is made with the first point.
 
         Args:
