@@ -18,6 +18,7 @@ from servobench.harness.run.starts import (
     PLACES,
     Box,
     BoxTask,
+    Move,
     are_apart,
     are_fit,
     drawn_moves,
@@ -48,7 +49,7 @@ class TourTask(BoxTask):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        box = self.box(setting.taught_on()[0].n)
+        box = self.box(setting)
         generator = named_generator(setting.seed, PLACES)
         moves = drawn_moves(box, setting, generator)
         start, target = next(moves)
@@ -73,7 +74,7 @@ class AgainTask(BoxTask):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        box = self.box(setting.taught_on()[0].n)
+        box = self.box(setting)
         moves = drawn_moves(box, setting, named_generator(setting.seed, PLACES))
         start, target = next(moves)
         there = Segment(self.hold, target)
@@ -133,9 +134,7 @@ def _next_place(
     )
 
 
-def _curve(
-    moves: Iterator[tuple[FloatArray, FloatArray]], duration: float, box: Box, setting: TaskSetting
-) -> Segment:
+def _curve(moves: Iterator[Move], duration: float, box: Box, setting: TaskSetting) -> Segment:
     """Return a lap about home, as far as half the way to start and target of moves, or less where that is not fit."""
     home = _home(box, setting)
     times = np.linspace(0.0, duration, LAP_POINTS, endpoint=False)

@@ -26,7 +26,7 @@ The start is found on the nominal arm. Where an arm cannot reach it with the tar
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from annotated_types import Gt, Le
@@ -60,6 +60,10 @@ STEPS = 8  # in which the arm is led from home to the start
 IN_VIEW = 0.9  # share of the image's half sides within which the target is at the start
 
 
+# Joint positions of start and target, (n,) and (n,) [rad]
+Move: TypeAlias = tuple[FloatArray, FloatArray]
+
+
 class Box(NamedTuple):
     """Where to draw."""
 
@@ -82,14 +86,15 @@ class BoxTask(Task):
     lowest: Number = 0.08
     """[m] least height of the ball above the table on the nominal model"""
 
-    def box(self, n: int) -> Box:
-        """Return where to draw the postures of an arm with n joints.
+    def box(self, setting: TaskSetting) -> Box:
+        """Return where to draw the postures of the arm on which targets are taught.
 
         Raises:
-            ValueError: corners of another size, or exchanged.
+            ValueError: corners of another size, or exchanged; or the plant brings a robot of its own.
         """
+        robot, _ = setting.taught_on()
         lower, upper = (
-            as_array(f"its setting {name}", getattr(self, name), (n,))
+            as_array(f"its setting {name}", getattr(self, name), (robot.n,))
             for name in ("lower", "upper")
         )
         if not (lower < upper).all():
@@ -107,9 +112,7 @@ class BoxTask(Task):
         )
 
 
-def drawn_moves(
-    box: Box, setting: TaskSetting, generator: np.random.Generator
-) -> Iterator[tuple[FloatArray, FloatArray]]:
+def drawn_moves(box: Box, setting: TaskSetting, generator: np.random.Generator) -> Iterator[Move]:
     """Yield joint positions of start and target, (n,) and (n,) rad, of moves that are fit.
 
     Raises:
@@ -120,9 +123,8 @@ def drawn_moves(
     if cameras is not None:
         while True:
             yield draw_in_view(box, setting, cameras.planned, generator)
-    n = robot.n
     for _ in range(MAX_PAIRS // PAIRS_AT_ONCE):
-        pairs = generator.uniform(box.lower, box.upper, (PAIRS_AT_ONCE, 2, n))
+        pairs = generator.uniform(box.lower, box.upper, (PAIRS_AT_ONCE, 2, robot.n))
         balls = robot.arm.ball_position(pairs)
         apart = norm(balls[:, 1] - balls[:, 0]) >= box.shortest
         fit = apart & _is_free(pairs, box, robot).all(axis=-1)
@@ -169,7 +171,7 @@ def stays_in_reach(target: FloatArray, box: Box, setting: TaskSetting) -> bool:
 
 def draw_in_view(
     box: Box, setting: TaskSetting, planned: SetupModel, generator: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+) -> Move:
     """Return joint positions of start and target, (n,) and (n,) rad.
 
     Args:
@@ -201,9 +203,7 @@ def draw_in_view(
     )
 
 
-def drawn_together(
-    start: FloatArray, target: FloatArray, robot: Robot, cameras: Cameras
-) -> tuple[FloatArray, FloatArray]:
+def drawn_together(start: FloatArray, target: FloatArray, robot: Robot, cameras: Cameras) -> Move:
     """Return start and target of a move, (n,) and (n,) rad, drawn together in tenths until both are in view.
 
     They are drawn towards the arm's home, where the target is in the middle of the images.

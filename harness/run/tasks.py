@@ -111,7 +111,7 @@ class RandomTask(BoxTask):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        box = self.box(setting.taught_on()[0].n)
+        box = self.box(setting)
         generator = named_generator(setting.seed, PLACES)
         start, target = next(drawn_moves(box, setting, generator))
         return setting.move(start, setting.taught(target), self.duration)

@@ -2,9 +2,12 @@
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from servobench.plant.contract.checks import FloatArray, Shape
+
+# θ, (..., P), and the poses of the cameras, (..., c, 4, 4)
+ModelState: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class Derivatives(NamedTuple):
@@ -39,13 +42,11 @@ class FeatureModel(ABC):
         return slice(found[0], found[-1] + 1)
 
     @abstractmethod
-    def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
+    def start(self, lead: Shape) -> ModelState:
         """Return θ (..., P) and cameras (..., c, 4, 4) of the nominal robot."""
 
     @abstractmethod
-    def moved(
-        self, theta: FloatArray, cameras: FloatArray, step: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def moved(self, theta: FloatArray, cameras: FloatArray, step: FloatArray) -> ModelState:
         """Return both after a step (..., P)."""
 
     def feature(

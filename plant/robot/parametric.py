@@ -31,7 +31,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, Shape
-from servobench.plant.contract.features import Derivatives, FeatureModel
+from servobench.plant.contract.features import Derivatives, FeatureModel, ModelState
 from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
@@ -99,15 +99,13 @@ class ParametricModel(FeatureModel):
         zeros = [f"zero_{name}" for name in joints]
         return (*place, *gears, *zeros, *links, *poses)
 
-    def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
+    def start(self, lead: Shape) -> ModelState:
         """Return `theta` and `cameras` of the planned robot for leading axes."""
         cameras = self.planned.poses
         theta = np.zeros((*lead, len(self.names)))
         return theta, np.broadcast_to(cameras, (*lead, *cameras.shape))
 
-    def moved(
-        self, theta: FloatArray, cameras: FloatArray, step: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def moved(self, theta: FloatArray, cameras: FloatArray, step: FloatArray) -> ModelState:
         """Return the state after a step, (..., P), of all parameters."""
         theta = theta + step
         increments = theta[..., self.pose_columns]

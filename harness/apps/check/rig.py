@@ -21,7 +21,7 @@ from servobench.harness.run.contract import HeldController
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray, Shape
-from servobench.plant.contract.features import Derivatives, FeatureModel
+from servobench.plant.contract.features import Derivatives, FeatureModel, ModelState
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.parametric import POSE
 
@@ -174,14 +174,12 @@ class RigModel(FeatureModel):
         """See `FeatureModel.names`."""
         return self._names
 
-    def start(self, lead: Shape) -> tuple[FloatArray, FloatArray]:
+    def start(self, lead: Shape) -> ModelState:
         """See `FeatureModel.start`."""
         cameras = np.broadcast_to(np.eye(4), (*lead, 1, 4, 4))
         return np.zeros((*lead, len(self.names))), cameras
 
-    def moved(
-        self, theta: FloatArray, cameras: FloatArray, step: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def moved(self, theta: FloatArray, cameras: FloatArray, step: FloatArray) -> ModelState:
         """See `FeatureModel.moved`."""
         theta = theta + step
         theta[..., self.pose_columns] = 0.0

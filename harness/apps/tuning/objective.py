@@ -208,18 +208,17 @@ def _runs_of(own: TuningSet) -> tuple[RunRequest, ...]:
             world = run // own.robots
             task, varied = KINDS[world]
             # Rendered drives have no setting for their overshoot.
-            drive = [pair for pair in level["drive"][world] if _setting(pair[0]) in known]
+            drive = [
+                (key, value)
+                for key, value in level["drive"][world]
+                if key.removeprefix("plant.") in known
+            ]
             noise = ("noise", level["noise"][world])
             latency = ("latency", level["latency"][world])
             values = (*varied, *drive, noise, latency)
             mismatch = Mismatch.parse(model + level["detector"][world])
             runs.append(RunRequest(plant, "", task, mismatch, seed, values))
     return tuple(runs)
-
-
-def _setting(key: str) -> str:
-    """Return the name of a setting without its section."""
-    return key.partition(".")[2]
 
 
 @dataclass(frozen=True)
