@@ -11,7 +11,7 @@ Delay, noise, latency and lost frames are those of `servobench.plant.bench.bench
 
 import math
 from functools import lru_cache, partial
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,26 +24,19 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import (
     Delay,
-    JointSpeed,
-    Positive,
     ShareBelowOne,
-    Usual,
     nested,
     settings,
 )
 from servobench.plant.contract.signals import BoolArray, Truth
-from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
+from servobench.plant.robot.hand_eye import JointsConfig, RobotModel, hand_eye_spec
 from servobench.plant.robot.mechanics import MechanicsConfig, Motion, Tool
 
 
 @settings
-class ArmConfig:
+class ArmConfig(JointsConfig):
     """Settings of this plant and of the exported arm; defaults are those of an arm under a stereo camera."""
 
-    max_joint_speed: JointSpeed = 1.0
-    """[rad/s] limit of every joint, besides its maker's (UR5: π)."""
-    joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
-    """[rad] largest joint position each way, besides its maker's limits."""
     lag: Delay = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     command_delay: Delay = 0.05

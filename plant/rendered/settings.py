@@ -12,7 +12,6 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import (
     Count,
     Delay,
-    JointSpeed,
     NonNegative,
     Number,
     Positive,
@@ -22,6 +21,7 @@ from servobench.plant.contract.settings import (
     settings,
 )  # fmt: skip
 from servobench.plant.robot import ur5
+from servobench.plant.robot.hand_eye import JointsConfig
 from servobench.plant.robot.robot import Robot
 
 RATED_PAYLOAD = 5.0  # [kg] a UR5's, by its maker
@@ -120,13 +120,9 @@ def drives_for(robot: Robot) -> DriveConfig:
 
 
 @settings
-class RenderedConfig:
+class RenderedConfig(JointsConfig):
     """Settings of a rendered plant; the defaults of loads and drives are a UR5's, and change with the robot."""
 
-    max_joint_speed: JointSpeed = 1.0
-    """[rad/s] limit of every joint, besides its maker's (UR5: π)."""
-    joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
-    """[rad] largest joint position each way, besides its maker's limits."""
     lag: Delay = 0.05
     """[s] τ, by which the drives smooth the commanded velocity; 0: none."""
     drives: DriveConfig = nested(DriveConfig)

@@ -8,15 +8,17 @@ camera the feature is the ball's centre in the camera frame (eqs. 1, 8 and 27 of
 The robots of many runs side by side are one model, whose arrays have leading axes (`plant.contract.lanes.stack`).
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, Self, TypeAlias
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, Shape, as_array
 from servobench.plant.contract.lanes import matrix
+from servobench.plant.contract.settings import JointSpeed, Positive, Usual, settings
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
 from servobench.plant.robot.arm import (
     JointLimits,
@@ -303,6 +305,16 @@ class TrueJacobian:
     def __call__(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂feature/∂(joint position), (..., m, n), for joint positions (..., n) in rad."""
         return self.model.jacobian(joint_position)
+
+
+@settings
+class JointsConfig:
+    """Settings of every plant that moves an arm itself: how fast and how far."""
+
+    max_joint_speed: JointSpeed = 1.0
+    """[rad/s] limit of every joint, besides its maker's (UR5: π)."""
+    joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
+    """[rad] largest joint position each way, besides its maker's limits."""
 
 
 def hand_eye_spec(
