@@ -10,12 +10,12 @@ from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
 from servobench.harness.batch.results import Manifest, ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS, FILES
-from servobench.harness.config.settings import tuned_settings
+from servobench.harness.config.settings import Sections, tuned_settings
 from servobench.harness.config.source import find_place
 from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
-from servobench.plant.contract.settings import Section, listed
+from servobench.plant.contract.settings import listed
 
 # Columns, with settings that are varied
 DESCRIBED = ("plant", "sensing", "controller", "task", "mismatch")
@@ -137,7 +137,7 @@ def mark_tuned(runs: pd.DataFrame, manifest: Manifest) -> pd.DataFrame:
     return runs.replace({"controller": marked(names, manifest)})
 
 
-def describe_settings(configuration: Mapping[str, Section]) -> dict[str, str]:
+def describe_settings(configuration: Sections) -> dict[str, str]:
     """Return every setting of the runs, given by section and name, as `section.name` and its text."""
     settings = {}
     for section, values in configuration.items():

@@ -3,7 +3,7 @@
 import operator
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from itertools import islice
 from multiprocessing import current_process
@@ -33,7 +33,7 @@ from servobench.harness.config.registry import (
     offered,
     offering,
 )
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Sections, Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_seed
 from servobench.harness.run.resolution import check_settings
@@ -42,13 +42,12 @@ from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import Section, native, remark
+from servobench.plant.contract.settings import native, remark
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 from servobench.plant.robot.mismatch import Mismatch
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry
-Sections: TypeAlias = Mapping[str, Section]
 
 
 class Results(NamedTuple):

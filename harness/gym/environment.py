@@ -1,6 +1,6 @@
 """Runs as environments of Gymnasium, alone or side by side: the policy is the controller, all else is the harness's."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, TypeAlias, cast, final
 
@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Sections, Settings
 from servobench.harness.run.experiment import Experiment, build, build_together
 from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.lanes import side_by_side_key
@@ -28,7 +28,6 @@ from servobench.plant.contract.checks import AnyArray, FloatArray, Floats32, as_
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_seed
-from servobench.plant.contract.settings import Section
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.plants import load_engine
@@ -179,7 +178,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         mismatch: str = "moderate",
         robot: str = DEFAULT_ROBOT,
         sensing: str = DEFAULT_SENSING,
-        settings: Mapping[str, Section] | None = None,
+        settings: Sections | None = None,
         render_mode: str | None = None,
         **others: object,
     ) -> None:

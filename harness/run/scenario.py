@@ -52,7 +52,7 @@ class Scenario:
     lap_time: float = math.nan  # time of a lap of a curve that is repeated [s]; NaN of any other
     moves: tuple[Span, ...] = ()  # parts of a sequence in which a target is held
     # instants at which the reference jumps, which no preview shows [s]
-    jumps: tuple[float, ...] = ()
+    jumps: Vector = ()
 
     def __post_init__(self) -> None:
         """Check that the evaluated part is one of the run, and the kind."""

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.cameras.optics import Optics, ideal_optics, in_image, project, project_rates
-from servobench.plant.contract.checks import FloatArray, Shape
+from servobench.plant.contract.checks import FloatArray, Shape, Triple
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.sensing import EXTENTS, LENGTH
@@ -86,7 +86,7 @@ class SensingSetup:
     scale: Callable[[float, float], float] | None = None
     tolerance: float = SETTLING_BAND
     cameras: int = 1
-    target: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)
+    target: tuple[Triple, ...] = ((0.0, 0.0, 0.0),)
     single: bool = False
     closeness: float = 1.0
     least_joints: int = 1

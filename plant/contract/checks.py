@@ -12,6 +12,7 @@ IntArray = npt.NDArray[np.int_]
 Floats32 = npt.NDArray[np.float32]
 AnyArray = npt.NDArray[Any]
 NamedArrays: TypeAlias = Mapping[str, FloatArray]
+Triple: TypeAlias = tuple[float, float, float]  # x, y and z, or another number of three parts
 Shape: TypeAlias = tuple[int, ...]  # sizes of axes, often of the leading ones alone
 REAL = "fiub"  # kinds of arrays, as numpy names them
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from annotated_types import Len
 
+from servobench.plant.contract.checks import Triple
 from servobench.plant.contract.dependence import Only
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import (
@@ -34,8 +35,8 @@ class Box(NamedTuple):
     """A box in the room, parallel to the axes of the base frame."""
 
     name: str  # in error messages
-    centre: tuple[float, float, float]  # (3,) [m], base frame
-    size: tuple[float, float, float]  # (3,) [m], its three sides
+    centre: Triple  # (3,) [m], base frame
+    size: Triple  # (3,) [m], its three sides
 
 
 @settings

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Triple
 from servobench.plant.contract.faults import one_line
 from servobench.plant.contract.files import read_text, user_path, yaml_loader
 from servobench.plant.robot import ur5
@@ -25,7 +25,6 @@ from servobench.plant.robot.arm import JointLimits, Links, SerialArm, arm_from_d
 from servobench.plant.robot.robot import Robot, at_far_end, cylinder_inertia
 from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
 
-Triple = tuple[float, float, float]
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 LENGTHS = ("a2", "a3", "d1", "d4", "d5", "d6")  # names of DH lengths that are not 0
 ALIKE = (2, 1, 3)  # joints of shoulder, elbow and wrist that share a number of a `Triple`

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, cast
@@ -14,9 +14,10 @@ from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.apps.check.report import (
+    Begin,
     Check,
     CheckFailed,
-    Finding,
+    Hear,
     Report,
     at,
     is_refusal,
@@ -59,8 +60,8 @@ SEED_REMEDY = "make one in reset: self.rng = np.random.default_rng(seed)"
 
 def check_controller(
     controller: str | type[Controller] | Controller | ControllerEntry,
-    begin: Callable[[str], None] = lambda _name: None,
-    found: Callable[[Finding], None] = lambda _finding: None,
+    begin: Begin = lambda _name: None,
+    found: Hear = lambda _finding: None,
 ) -> Report:
     """Check a controller against its contract, in this process.
 

@@ -1,11 +1,18 @@
 """The contract of a plant, checked on a mismatched arm: `check_plant`."""
 
 import contextlib
-from collections.abc import Callable
 
 import numpy as np
 
-from servobench.harness.apps.check.report import Check, CheckFailed, Finding, Report, naming, report
+from servobench.harness.apps.check.report import (
+    Begin,
+    Check,
+    CheckFailed,
+    Hear,
+    Report,
+    naming,
+    report,
+)
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.harness.run.contract import HeldPlant
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
@@ -41,8 +48,8 @@ MIN_MOTION = 1e-3  # [natural size of the feature], below which the Jacobian can
 
 def check_plant(
     plant: str | type[Plant] | type[World] | PlantEntry,
-    begin: Callable[[str], None] = lambda _name: None,
-    found: Callable[[Finding], None] = lambda _finding: None,
+    begin: Begin = lambda _name: None,
+    found: Hear = lambda _finding: None,
 ) -> Report:
     """Check a plant against its contract, in this process.
 

@@ -76,6 +76,10 @@ def is_refusal(error: ValueError) -> bool:
     return isinstance(error.__cause__, ValueError | RunFault | None)
 
 
+Begin: TypeAlias = Callable[[str], None]  # receives the name of a check that begins
+Hear: TypeAlias = Callable[[Finding], None]  # receives findings as they come
+
+
 class Check(NamedTuple):
     """One check of a subject."""
 
@@ -94,8 +98,8 @@ class Check(NamedTuple):
 def report(
     subject: str,
     checks: Iterable[Check],
-    begin: Callable[[str], None],
-    found: Callable[[Finding], None],
+    begin: Begin,
+    found: Hear,
 ) -> Report:
     """Carry out checks one after the other and return their findings.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from servobench.harness.apps.check.report import Finding
+from servobench.harness.apps.check.report import Finding, Hear
 from servobench.harness.batch.trials import attempt
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 Checks: TypeAlias = Callable[..., Any]
 
 
-def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Finding], None]) -> None:
+def run_checks(checks: Checks, subject: str, limit: float, hear: Hear) -> None:
     """Carry checks out and hand over the findings; a check that ends or hangs the process is the last.
 
     Args:

@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from servobench.harness.apps.films.replay import LoggedRun, Replay, logged_run
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, Triple
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND
@@ -171,9 +171,7 @@ def _scene(shown: LoggedRun, k: int, time: float) -> dict[str, Message]:
     return messages
 
 
-def _line(
-    time: float, kind: int, colour: tuple[float, float, float], points: FloatArray
-) -> Message:
+def _line(time: float, kind: int, colour: Triple, points: FloatArray) -> Message:
     """Return a marker of lines through points of the base frame, (k, 3) m; it stays until the next one."""
     return {
         "header": _header(time, urdf.BASE_LINK),
