@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, Shape, as_array
 from servobench.plant.contract.lanes import matrix
+from servobench.plant.contract.settings import Names
 
 # IntArray of the factors in a cross product
 YZX = np.array([1, 2, 0])
@@ -84,7 +85,7 @@ class SerialArm:
     All arrays have the same leading axes.
     """
 
-    joint_names: tuple[str, ...]  # n names
+    joint_names: Names  # n names
     translation: FloatArray  # (..., n+1, 3), m; row i leads from frame i to joint i+1, the last row to the flange.
     rpy: FloatArray  # (..., n+1, 3), rad; the rotations that belong to them.
     joint_offset: FloatArray  # (..., n), rad.
@@ -184,7 +185,7 @@ class SerialArm:
 
 
 def plain_arm(
-    joint_names: tuple[str, ...],
+    joint_names: Names,
     translation: FloatArray,
     rpy: FloatArray,
     tool: npt.ArrayLike = (0.0, 0.0, 0.0),
@@ -194,11 +195,16 @@ def plain_arm(
     return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.asarray(tool))
 
 
+def numbered_joints(n: int) -> Names:
+    """Return names for the joints of an arm that has none."""
+    return tuple(f"joint_{i}" for i in range(1, n + 1))
+
+
 def arm_from_dh(
     a: npt.ArrayLike,
     d: npt.ArrayLike,
     alpha: npt.ArrayLike,
-    joint_names: tuple[str, ...],
+    joint_names: Names,
     *,
     modified: bool = False,
 ) -> SerialArm:

@@ -26,7 +26,7 @@ from servobench.plant.contract.files import (
 )
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import Section, suggest
-from servobench.plant.robot.arm import SerialArm, arm_from_dh, narrow_limits
+from servobench.plant.robot.arm import SerialArm, arm_from_dh, narrow_limits, numbered_joints
 from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
@@ -264,6 +264,5 @@ def _draw_arm(n: int, generator: np.random.Generator) -> SerialArm:
     quarters = generator.choice([-1.0, 0.0, 1.0], n)
     skews = generator.uniform(-MAX_SKEW, MAX_SKEW, n)
     twists = 0.5 * math.pi * quarters + skews
-    names = tuple(f"joint_{i}" for i in range(1, n + 1))
-    arm = with_ball(arm_from_dh(a, d, twists, names))
+    arm = with_ball(arm_from_dh(a, d, twists, numbered_joints(n)))
     return replace(arm, gear_ratio=generator.choice([-1.0, 1.0], n))

@@ -36,7 +36,7 @@ from servobench.plant.contract.settings import (
     remark,
     settings,
 )
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, numbered_joints
 from servobench.plant.robot.makers import known_title, read_calibration, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.workspace import find_workspace, with_ball
@@ -137,7 +137,7 @@ def read_dh_robot(path: Path, values: Section) -> Robot:
 def _arm_of(table: DhTable) -> SerialArm:
     """Return the arm of a DH table, without a ball."""
     n = len(table.joint_lower)
-    names = table.joint_names or tuple(f"joint_{i}" for i in range(1, n + 1))
+    names = table.joint_names or numbered_joints(n)
     if len(names) != n:
         raise ValueError(f"joint_names must hold {n} names, got {len(names)}")
     arm = arm_from_dh(table.a, table.d, table.alpha, names, modified=table.convention == "modified")

@@ -21,7 +21,14 @@ from servobench.plant.contract.checks import FloatArray, Triple
 from servobench.plant.contract.faults import one_line
 from servobench.plant.contract.files import read_text, user_path, yaml_loader
 from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import JointLimits, Links, SerialArm, arm_from_dh, plain_arm
+from servobench.plant.robot.arm import (
+    JointLimits,
+    Links,
+    SerialArm,
+    arm_from_dh,
+    numbered_joints,
+    plain_arm,
+)
 from servobench.plant.robot.robot import Robot, at_far_end, cylinder_inertia
 from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
 
@@ -99,8 +106,9 @@ def universal_robot(title: str) -> Robot:
 def panda() -> Robot:
     """Return Franka's Panda, the arm with seven joints."""
     facts = ur5.ARMS["panda"]
-    joints = tuple(f"joint_{i}" for i in range(1, 8))
-    arm = with_ball(arm_from_dh(facts["a"], facts["d"], facts["alpha"], joints, modified=True))
+    arm = with_ball(
+        arm_from_dh(facts["a"], facts["d"], facts["alpha"], numbered_joints(7), modified=True)
+    )
     limits = JointLimits(facts["lower"], facts["upper"], facts["speed"])
     tensors = [
         [(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]
