@@ -1,6 +1,7 @@
 """The contract of a model whose features depend on joints and on parameters, such as the nominal robot of a run."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
@@ -16,6 +17,11 @@ class Derivatives(NamedTuple):
     feature: FloatArray  # y, (..., k, m)
     by_joint: FloatArray  # ∂y/∂q, (..., k, m, n), per rad
     by_parameter: FloatArray  # ∂y/∂θ, (..., k, m, P), per unit of each parameter
+
+
+def parameters_of_joints(joints: Sequence[str]) -> list[str]:
+    """Return the names of the deviations of gears and then of zeros, one for each joint."""
+    return [f"{kind}_{joint}" for kind in ("gear", "zero") for joint in joints]
 
 
 class FeatureModel(ABC):

@@ -31,16 +31,20 @@ from typing import NamedTuple, final
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, Shape
-from servobench.plant.contract.features import Derivatives, FeatureModel, ModelState
+from servobench.plant.contract.features import (
+    Derivatives,
+    FeatureModel,
+    ModelState,
+    parameters_of_joints,
+)
 from servobench.plant.contract.lanes import nearest_rotation
 from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
-from servobench.plant.robot.twin import TOOL, links_of
+from servobench.plant.robot.twin import POSE, TOOL, links_of
 
 TARGET = ("target_x", "target_y", "target_z")
 """[m] added to the target's place in the base frame, for cameras on the hand."""
 ALIGNMENT = 0.002  # [m²] weight of the planned rotation in `placed`
-POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 AXES = np.eye(3)
 Rotations = list[list[list[float]] | None]  # the rows of each; None for no rotation
 
@@ -88,16 +92,14 @@ class ParametricModel(FeatureModel):
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The names of the P parameters."""
-        joints = self.planned.arm.joint_names
         place = TARGET if self.planned.mount == "hand" else TOOL
         links = [name for name, _, _ in links_of(self.planned.arm)]
         poses = []
         for camera in range(len(self.planned.poses)):
             prefix = "camera" if camera == 0 else f"camera{camera + 1}"
             poses += [f"{prefix}_{each}" for each in POSE]
-        gears = [f"gear_{name}" for name in joints]
-        zeros = [f"zero_{name}" for name in joints]
-        return (*place, *gears, *zeros, *links, *poses)
+        joints = parameters_of_joints(self.planned.arm.joint_names)
+        return (*place, *joints, *links, *poses)
 
     def start(self, lead: Shape) -> ModelState:
         """Return `theta` and `cameras` of the planned robot for leading axes."""

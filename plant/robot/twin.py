@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.features import parameters_of_joints
 from servobench.plant.contract.files import Record
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import (
@@ -41,7 +42,8 @@ from servobench.plant.robot.camera_file import ROUNDED, CameraFile, frame_time
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 
 TIMES = ("latency", "command_delay", "lag")
-CAMERA = tuple(f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z"))
+POSE = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+CAMERA = tuple(f"camera_{each}" for each in POSE)
 TOOL = ("tool_x", "tool_y", "tool_z")
 LENS = ("focal", "centre_u", "centre_v", "distortion")
 MAX_DEVIATION = 0.5  # [s, m, rad or 1] usual largest deviation of a parameter
@@ -51,10 +53,9 @@ Parameters = Mapping[str, float]  # values by the names of `parameter_names`
 
 def parameter_names(arm: SerialArm) -> tuple[str, ...]:
     """Return the names of all parameters of an arm and its camera."""
-    gears = [f"gear_{name}" for name in arm.joint_names]
-    zeros = [f"zero_{name}" for name in arm.joint_names]
+    joints = parameters_of_joints(arm.joint_names)
     links = [name for name, _, _ in links_of(arm)]
-    return (*TIMES, *CAMERA, *TOOL, *LENS, *gears, *zeros, *links)
+    return (*TIMES, *CAMERA, *TOOL, *LENS, *joints, *links)
 
 
 def links_of(arm: SerialArm) -> Iterator[tuple[str, int, int]]:

@@ -21,9 +21,14 @@ from servobench.harness.run.contract import HeldController
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray, Shape
-from servobench.plant.contract.features import Derivatives, FeatureModel, ModelState
+from servobench.plant.contract.features import (
+    Derivatives,
+    FeatureModel,
+    ModelState,
+    parameters_of_joints,
+)
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
-from servobench.plant.robot.parametric import POSE
+from servobench.plant.robot.twin import CAMERA, POSE
 
 PERIOD = 0.05  # [s]
 PREVIEW = 10  # [rows]
@@ -164,10 +169,7 @@ class RigModel(FeatureModel):
     def __init__(self, rig: Rig) -> None:
         """Take the rig, whose arm has the same features and Jacobian but for `MODEL_ERROR`."""
         self._rig = rig
-        joints = rig.spec.joint_names
-        gears = [f"gear_{joint}" for joint in joints]
-        zeros = [f"zero_{joint}" for joint in joints]
-        self._names = (*gears, *zeros, *(f"camera_{each}" for each in POSE))
+        self._names = (*parameters_of_joints(rig.spec.joint_names), *CAMERA)
 
     @property
     def names(self) -> tuple[str, ...]:
