@@ -101,7 +101,7 @@ def controller_samples(
     steps = signed_shares * (spec.joint_velocity_limit * plan.step)
     back = np.concatenate([np.zeros((count, 1, n)), np.cumsum(steps, axis=1)], axis=1)
     J = jacobian(q)
-    errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
+    errors = error[:, None, :] + back[:, : plan.error_history] @ J.mT
     positions = q[:, None, :] - back[:, : plan.position_history]
 
     pinv = damped_inverse(J, plan.damping)

@@ -190,7 +190,7 @@ class JacobianNetwork:
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Centres of the layers, (U, n, L), or (1, n, L) where all share them; ones, (n,); and −1/δ², (U, L)."""
         _, first = np.unique(self.layer_of, return_index=True)
-        centres = self.centres[first].swapaxes(-1, -2)
+        centres = self.centres[first].mT
         if (centres == centres[0]).all():
             centres = centres[:1]
         decay = -1.0 / self.widths[first] ** 2

@@ -277,7 +277,7 @@ def _whitened(
 
 def _along(by_joint: FloatArray, motion: FloatArray) -> FloatArray:
     """Return Σ_j ∂h/∂q_j v_j, (..., E, m, F), of derivatives (..., E, n, m, F) and motions (..., E, F, n)."""
-    motion = np.swapaxes(motion, -1, -2)[..., None, :]
+    motion = motion.mT[..., None, :]
     return np.add.reduce(by_joint * motion, axis=-3)
 
 
@@ -487,7 +487,7 @@ class Fit:
         since = frames.time[..., None, :]
         turn = members.turning[..., None] * since
         found = self.derivatives(members, q, turn)
-        weight = np.swapaxes(frames.weight, -1, -2)[..., None, :, :]
+        weight = frames.weight.mT[..., None, :, :]
         # In the unit of the frames' features; 0 for those that are not valid.
         size = weight / self.scale
         by_joint = size[..., None, :, :] * np.swapaxes(found.by_joint, -1, -3)
@@ -516,7 +516,7 @@ class Fit:
         feature = frames.feature[..., None, :, :]
         weight = frames.weight[..., None, :, :]
         residual = weight * (feature - seen / self.scale)
-        return np.swapaxes(residual, -1, -2)
+        return residual.mT
 
     def costs(
         self, members: Members, fitted: Fitted, lateness: FloatArray, variance: FloatArray
@@ -559,8 +559,8 @@ class Fit:
 
         # ½ ∂(3 − tr(R₀ᵀ R exp([δ]×)))/∂δ
         R = members.cameras[..., :3, :3]
-        A = np.swapaxes(planned[..., :3, :3], -1, -2) @ R
-        odd = A - np.swapaxes(A, -1, -2)
+        A = planned[..., :3, :3].mT @ R
+        odd = A - A.mT
         slope = 0.5 * odd[..., (1, 2, 0), (2, 0, 1)]
         own[..., self._turns] = 1.0
         pull[..., self._turns] = slope.reshape(every)
@@ -587,7 +587,7 @@ class Fit:
         wide = (*rates.shape[:-2], -1)
         D = (rates * weight[..., None, None, :]).reshape(wide)
         r = (residual * weight[..., None, :]).reshape(*wide[:-2], -1)
-        H = D @ np.swapaxes(D, -1, -2)
+        H = D @ D.mT
         g = np.matvec(D, r) + pull
         diagonal = np.diagonal(H, axis1=-2, axis2=-1) + information
         damped = information + members.damping[..., None] * diagonal

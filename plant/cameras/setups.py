@@ -422,7 +422,7 @@ class SetupModel(RobotModel):
         # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
         rotations = self.cameras[..., None, None, :3, :3]
         turned = np.vecmat(motions[..., None, :, :, :], rotations)
-        return points, np.swapaxes(turned, -1, -2)
+        return points, turned.mT
 
     def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
         """Return which features are valid, (..., m), for points in the frame of each camera, (..., c, p, 3) m."""

@@ -167,7 +167,7 @@ class SerialArm:
         frames = self.frames(joint_position)
         ball = self.ball(frames)
         motions = self.motions(frames, ball[..., None, :])[..., 0, :, :]
-        return ball, np.swapaxes(motions, -1, -2)
+        return ball, motions.mT
 
     def motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
         """Return g_i z_i × (p − p_i), (..., p, n, 3) m/rad, for points (..., p, 3) m of the base frame and `frames`."""

@@ -234,7 +234,7 @@ class HandEyeModel(RobotModel):
         lead = np.broadcast_shapes(self.lead, np.shape(self.X_BC)[:-2])
         pose = as_array("X_BC", self.X_BC, (*lead, 4, 4))
         R = pose[..., :3, :3]
-        product = R @ np.swapaxes(R, -1, -2)
+        product = R @ R.mT
         deviation = np.abs(product - np.eye(3)).max(initial=0.0)
         is_mirrored = np.linalg.det(R) < 0.0
         if deviation > ROTATION_TOLERANCE or is_mirrored.any():
@@ -280,7 +280,7 @@ class HandEyeModel(RobotModel):
     def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, None]:
         """Return the ball centre in the camera frame, (..., 3) m, and its Jacobian, (..., 3, n) m/rad."""
         p_B, J_B = self.arm.ball_and_jacobian(joint_position)
-        R_CB = np.swapaxes(self.X_BC[..., :3, :3], -1, -2)
+        R_CB = self.X_BC[..., :3, :3].mT
         y = self.to_camera(p_B)
         J = R_CB @ J_B
         y.setflags(write=False)

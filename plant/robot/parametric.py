@@ -198,8 +198,8 @@ class ParametricModel(FeatureModel):
         middle = share @ ball
         mean = share @ features
         planned = self.planned.poses[0, :3, :3]
-        from_mean = (features - mean) * np.swapaxes(weight[..., None, :], -1, -2)
-        spread = np.swapaxes(ball - middle, -1, -2) @ from_mean
+        from_mean = (features - mean) * weight[..., None, :].mT
+        spread = (ball - middle).mT @ from_mean
         R = nearest_rotation(spread + ALIGNMENT * planned)
         place = middle - np.matvec(R, mean[..., 0, :])[..., None, :]
         new = np.broadcast_to(cameras, (*R.shape[:-2], *cameras.shape[-3:])).copy()

@@ -109,7 +109,7 @@ def cylinder_inertia(mass: FloatArray, radius: FloatArray, arm: SerialArm) -> Fl
 def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> Bodies:
     """Return centres of mass (n, 3) m and inertia (n, 3, 3) kg m², given in joint frames, in the frames of `Links`."""
     R = rotation_from_rpy(arm.rpy[1:])
-    turned_back = np.swapaxes(R, -1, -2)
+    turned_back = R.mT
     moved_centre = np.vecmat(centre - arm.translation[1:], R)
     return moved_centre, turned_back @ inertia @ R
 

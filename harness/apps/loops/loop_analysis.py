@@ -192,8 +192,8 @@ def controller_response(records: list[Record], period: float) -> tuple[FloatArra
     V = _spectra([record.measured for record in records])
     U = _spectra([record.command for record in records])
     # C V = U, solved as Vᵀ Cᵀ = Uᵀ
-    transposed = np.linalg.solve(np.swapaxes(V, -1, -2), np.swapaxes(U, -1, -2))
-    response = np.swapaxes(transposed, -1, -2)
+    transposed = np.linalg.solve(V.mT, U.mT)
+    response = transposed.mT
     length = len(records[0].measured)
     harmonics = np.arange(1, length // 2 + 1)
     frequency = 2.0 * np.pi * harmonics / (length * period)
