@@ -5,7 +5,7 @@ import numpy as np
 from servobench.plant.contract import lanes
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import branch, plus_diagonal
+from servobench.plant.contract.lanes import branch, entries, plus_diagonal
 
 MAX_DAMPED_RATIO = (
     1e9  # [1] largest ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
@@ -60,5 +60,5 @@ def project_to_row_space(weights: FloatArray, jacobian: FloatArray) -> FloatArra
     _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
     counts = singular > MIN_SINGULAR_RATIO * singular[..., :1]
     basis = rows * counts[..., None]
-    flat = weights.reshape(*weights.shape[:-2], -1)
+    flat = entries(weights)
     return np.asarray(basis.mT @ (basis @ flat)).reshape(weights.shape)

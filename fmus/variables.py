@@ -22,6 +22,7 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.optics import COLUMNS
 from servobench.plant.cameras.setups import SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray, NamedArrays, Shape
+from servobench.plant.contract.lanes import entries
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import Mount, RobotModel
@@ -298,7 +299,7 @@ def _sensing_parameters(model: RobotModel) -> NamedArrays:
     }
     if optics.further is not None:
         values["calibration"] = optics.further
-    flat = {name: _flat(matrix) for name, matrix in values.items()}
+    flat = {name: entries(matrix) for name, matrix in values.items()}
     return {**flat, "focal_length": optics.focal, "distortion": optics.distortion}
 
 
@@ -306,8 +307,3 @@ def _camera_parameters(X_BC: FloatArray) -> NamedArrays:
     """Return position and angles of cameras, (..., 3), by name."""
     angles = rpy_from_rotation(X_BC[..., :3, :3])
     return {"camera_position": X_BC[..., :3, 3], "camera_rpy": angles}
-
-
-def _flat(values: FloatArray) -> FloatArray:
-    """Return matrices (..., i, j) as vectors (..., i j)."""
-    return np.reshape(values, (*values.shape[:-2], -1))

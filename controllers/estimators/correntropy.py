@@ -28,7 +28,7 @@ from servobench.controllers.estimators.kalman import (
     symmetric,
 )
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, outer, repeat
+from servobench.plant.contract.lanes import entries, norm, outer, repeat
 from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
@@ -173,8 +173,8 @@ def fixed_point_update(
         new = J + nu[..., None] * gain
         # B⁻¹ (J⁻ − J) without a solve: J − J⁻ = ν Kᵀ, and B⁻¹ K is the share times the spread.
         prior = -(share * nu)[..., None] * spread
-        change = norm(_flat(new - at.J))
-        moves = change > config.tolerance * norm(_flat(at.J))
+        change = norm(entries(new - at.J))
+        moves = change > config.tolerance * norm(entries(at.J))
         return Iteration(Iterate(new, gain, prior, moves), tree.given)
 
     none = np.zeros_like(J)
@@ -186,11 +186,6 @@ def fixed_point_update(
 
 def _moves(tree: Iteration) -> BoolArray:
     return tree.at.moves
-
-
-def _flat(J: FloatArray) -> FloatArray:
-    """Return the entries of each J, (..., mn)."""
-    return J.reshape(*J.shape[:-2], -1)
 
 
 def mckf_estimator(

@@ -20,7 +20,7 @@ from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.dependence import Only
-from servobench.plant.contract.lanes import branch, outer
+from servobench.plant.contract.lanes import branch, entries, outer
 from servobench.plant.contract.settings import NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
@@ -113,8 +113,8 @@ class ProjectionEstimator(GatedEstimator[ProjectionState]):
         state = state._replace(J=J)
         if isinstance(config, BroydenConfig) or not config.reset:
             return state
-        flat = J.reshape(*J.shape[:-2], -1)
-        first = state.J0.reshape(*J.shape[:-2], -1)
+        flat = entries(J)
+        first = entries(state.J0)
         turned = np.vecdot(flat, first) <= 0.0
         vanished = np.vecdot(flat, flat) < config.reset_norm**2
         return branch(turned | vanished, _reset, state)

@@ -14,7 +14,7 @@ import numpy as np
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import plus_diagonal
+from servobench.plant.contract.lanes import plus_diagonal, solve
 from servobench.plant.contract.settings import Positive, PositiveOrInfinite, settings
 from servobench.plant.contract.signals import Observation
 
@@ -42,7 +42,7 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
         The joint step of one period, (..., n), rad.
     """
     square = plus_diagonal(J @ J.mT, step_weight)
-    solution = np.linalg.solve(square, e[..., None])[..., 0]
+    solution = solve(square, e)
     return step_factor * np.vecmat(solution, J)
 
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.features import Derivatives, FeatureModel
-from servobench.plant.contract.lanes import branch, pick, plus_diagonal, where
+from servobench.plant.contract.lanes import branch, pick, plus_diagonal, solve, where
 from servobench.plant.contract.signals import BoolArray
 
 FRAMES = 160  # rows of the buffer
@@ -592,7 +592,7 @@ class Fit:
         diagonal = np.diagonal(H, axis1=-2, axis2=-1) + information
         damped = information + members.damping[..., None] * diagonal
         A = plus_diagonal(H, damped)
-        step = np.linalg.solve(A, g[..., None])[..., 0]
+        step = solve(A, g)
         step = step * self._shrink(step)[..., None]
         tried = self.moved(members, step)
         found = self.residual(tried, frames)

@@ -49,7 +49,7 @@ from servobench.controllers.stages.regression import (
     of_filter,
 )
 from servobench.plant.contract.checks import FloatArray, IntArray
-from servobench.plant.contract.lanes import branch, norm, pick
+from servobench.plant.contract.lanes import branch, entries, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation
 
 # A motion over lost frames teaches nothing if it is longer than this many motions of the least length.
@@ -550,7 +550,7 @@ class Pairing:
         R = regression.rotation
         # ‖R − I‖² = 4 (1 − cos φ) for a rotation by φ about one axis.
         difference = R - np.eye(self._m)
-        turned = difference.reshape(*R.shape[:-2], -1)
+        turned = entries(difference)
         cosine = 1.0 - 0.25 * np.vecdot(turned, turned)
         angle = np.arccos(np.maximum(cosine, -1.0))
         deviation = self.regression.deviation(regression)

@@ -43,7 +43,7 @@ from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.controllers.stages.pairing import Past
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.lanes import branch, solve
 from servobench.plant.contract.signals import Observation
 
 # [s] Motions are compared over this time, and over a period at least: steps of encoders spoil shorter ones.
@@ -163,7 +163,7 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
     kept = np.minimum(1.0, most / excitation)[..., None]
     A = kept[..., None] * A
     b = kept * b
-    response = np.linalg.solve(A, b[..., None])[..., 0]
+    response = solve(A, b)
     # In longer windows single entries are not identified, and limits would shift their sum.
     if state.window == 1:
         response = np.minimum(np.maximum(response, 0.0), MAX_RESPONSE)

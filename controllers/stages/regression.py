@@ -41,7 +41,7 @@ from servobench.controllers.algebra import nearest_rotation
 from servobench.controllers.controller import RobotKnowledge
 from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import Tree, branch, map_arrays, outer, pick
+from servobench.plant.contract.lanes import Tree, branch, entries, map_arrays, outer, pick
 from servobench.plant.contract.signals import BoolArray
 
 GATE = 10.0  # [1] g, the largest ‖ν‖²/s; the excess is taken for noise of the frame
@@ -157,7 +157,7 @@ def learn(
         some = np.logical_or.reduce(learns[part].reshape(-1), axis=-1)
         new[...] = branch(some, _corrected, bank[part], known[part], gain[part])
         # P begins after m rows of K entries, so that its diagonal is every (K+1)-th entry from there.
-        flat = new.reshape(*new.shape[:-2], -1)
+        flat = entries(new)
         diagonal = flat[..., m * K :: K + 1]
         diagonal[..., :-1] += walk[part]
         new[..., -1] = noisy[part]

@@ -176,6 +176,16 @@ def norm(x: FloatArray) -> FloatArray:
     return np.sqrt(np.vecdot(x, x))
 
 
+def entries(M: FloatArray) -> FloatArray:
+    """Return the entries of matrices (..., m, n), row by row, (..., mn)."""
+    return M.reshape(*M.shape[:-2], -1)
+
+
+def solve(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Return A⁻¹ b, (..., n), for A (..., n, n) and b (..., n)."""
+    return np.asarray(np.linalg.solve(A, b[..., None])[..., 0], dtype=np.float64)
+
+
 def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:
     """Return A + diag(value), (..., n, n), for A (..., n, n) and one number, (n,) or (..., n)."""
     rows = value if isinstance(value, float) else np.atleast_1d(value)[..., None, :]

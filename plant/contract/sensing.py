@@ -26,6 +26,7 @@ from annotated_types import Ge, Gt, Le
 
 from servobench.plant.contract.checks import FloatArray, Shape
 from servobench.plant.contract.dependence import Only
+from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import Draw
 from servobench.plant.contract.settings import (
     Delay,
@@ -319,4 +320,4 @@ def quantise(feature: FloatArray, quantum: float) -> FloatArray:
 def draw_directions(generator: np.random.Generator, shape: Shape) -> FloatArray:
     """Return unit vectors, (..., m), of directions that are uniform on the sphere."""
     x = generator.standard_normal(shape)
-    return x / np.sqrt(np.vecdot(x, x))[..., None]
+    return x / norm(x)[..., None]

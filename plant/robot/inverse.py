@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, plus_diagonal, take
+from servobench.plant.contract.lanes import norm, plus_diagonal, solve, take
 from servobench.plant.robot.arm import SerialArm
 
 STARTS = 16
@@ -142,7 +142,7 @@ def _step(
     free = ~(leaves_below | leaves_above)
     J = J * free[..., None, :]
     damped = plus_diagonal(J @ J.mT, damping[..., None])
-    weighted = np.linalg.solve(damped, error[..., None])[..., 0]
+    weighted = solve(damped, error)
     step = np.vecmat(weighted, J)
     return np.clip(q + step, lower, upper)
 
