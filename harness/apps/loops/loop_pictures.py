@@ -23,7 +23,7 @@ from servobench.harness.apps.loops.loop_analysis import LoopAnalysis
 from servobench.harness.apps.loops.systems import largest_gain, loci, sensitivity
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.facts import read_beside
-from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.files import write_text
 
 PAGE = "analyse.html"
 TEMPLATE = "loops.html"
@@ -134,7 +134,7 @@ def write_pictures(
     template = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8"))
     text = template.substitute(fields)
     page = folder / PAGE
-    write_atomically(page, lambda path: path.write_text(text, encoding="utf-8"))
+    write_text(page, text)
     return [page, *paths]
 
 
