@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias, TypeVar, final
 
 import numpy as np
 
@@ -143,6 +143,9 @@ class CalibrationState(NamedTuple):
     def fitted(self) -> BoolArray:
         """Whether members are fitted, (...)."""
         return np.equal(self.begun, ANNEALED)
+
+
+Holder = TypeVar("Holder", CalibrationState, Known)
 
 
 class Ahead(NamedTuple):
@@ -529,8 +532,7 @@ class Calibration:
     def _reduced(self, state: CalibrationState, size: int) -> CalibrationState:
         """Return the state with the best members alone, as many as `size`."""
         kept = state.members.best(size)
-        members, share, bias = _of(kept, state.members, state.share, state.bias)
-        return state._replace(members=members, share=share, bias=bias)
+        return _picked(state, kept)
 
     def _remembered(
         self,
@@ -629,20 +631,21 @@ def _floor(noise: FloatArray) -> FloatArray:
     return variance[..., None]
 
 
-def _of(
-    kept: IntArray, members: Members, share: FloatArray, bias: FloatArray
-) -> tuple[Members, FloatArray, FloatArray]:
-    """Return the members of indices `kept` (..., k), with their weights, which sum to 1, and biases."""
-    own = pick(share, kept, axes=1)
+def _picked(known: Holder, kept: IntArray) -> Holder:
+    """Return what is known of the members of indices `kept` (..., k) alone, whose weights sum to 1 again."""
+    own = pick(known.share, kept, axes=1)
     total = np.maximum(np.add.reduce(own, axis=-1), MIN_TOTAL)
-    return members.picked(kept), own / total[..., None], pick(bias, kept, axes=1)
+    return known._replace(
+        members=known.members.picked(kept),
+        share=own / total[..., None],
+        bias=pick(known.bias, kept, axes=1),
+    )
 
 
 def _trimmed(known: Known, size: int) -> Known:
     """Return what was known, with the best members alone."""
     kept = np.argsort(-known.share, axis=-1)[..., :size]
-    members, share, bias = _of(kept, known.members, known.share, known.bias)
-    return known._replace(members=members, share=share, bias=bias)
+    return _picked(known, kept)
 
 
 def _median_of(values: FloatArray, chosen: BoolArray) -> FloatArray:
