@@ -28,6 +28,7 @@ from servobench.plant.cameras.symbolic import (
     features,
     points_in_cameras,
     symbolic_rotation,
+    symbols,
     valid_features,
 )
 from servobench.plant.contract.checks import AnyArray, NamedArrays, Shape
@@ -127,11 +128,7 @@ def core_functions(layout: ArmLayout) -> list[Any]:
     n = layout.by_name["joint_position"].size
     n_states = 2 * n + 6
     n_parameters = sum(group.size for group in layout.kinematic)
-    s = casadi.SX.sym("s", n_states)
-    ds = casadi.SX.sym("ds", n_states)
-    p = casadi.SX.sym("p", n_parameters)
-    dp = casadi.SX.sym("dp", n_parameters)
-    c = casadi.SX.sym("c", n)
+    s, ds, p, dp, c = symbols(s=n_states, ds=n_states, p=n_parameters, dp=n_parameters, c=n)
     feature, jacobian, motion, rates = _equations(layout, s, p, c)
     row_major = casadi.vec(jacobian.T)
     variables = casadi.vertcat(s, p)

@@ -47,6 +47,11 @@ class ArmGeometry(NamedTuple):
         )
 
 
+def symbols(**sizes: int) -> list[SX]:
+    """Return symbols of CasADi by name with their sizes."""
+    return [casadi.SX.sym(name, size) for name, size in sizes.items()]
+
+
 def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], list[SX], SX, SX]:
     """Return the axes z_i and origins p_i of the joints, and rotation and position of the flange, as expressions.
 

@@ -22,10 +22,10 @@ import casadi
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from servobench.plant.cameras.symbolic import SX, symbols
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.settings import DriveConfig
 
-SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 Arrays: TypeAlias = tuple[FloatArray, ...]
 PHYSICS_STEP = 0.001  # [s] where it divides the time to simulate, which otherwise has equal steps that are not longer
 # Bandwidths of the outer loops over that of the velocity loop: the poles stay damped at twice the inertia.
@@ -191,7 +191,7 @@ class Drives:
 
     def _reference_law(self, n: int) -> casadi.Function:
         """Return (blend, u, loops) -> loops with the reference one physics step later."""
-        arguments = _symbols(blend=1, u=n, loops=3 * n)
+        arguments = symbols(blend=1, u=n, loops=3 * n)
         blend, u, loops = arguments
         r, c, z = casadi.vertsplit(loops, n)
         r, c = self._followed(blend, u, r, c)
@@ -199,7 +199,7 @@ class Drives:
 
     def _law(self, n: int) -> casadi.Function:
         """Return (blend, u, loops, θ, ω, ĝ) -> loops a physics step later, torque and drag for this step."""
-        arguments = _symbols(blend=1, u=n, loops=3 * n, theta=n, omega=n, gravity=n)
+        arguments = symbols(blend=1, u=n, loops=3 * n, theta=n, omega=n, gravity=n)
         blend, u, loops, theta, omega, gravity = arguments
         r, c, z = casadi.vertsplit(loops, n)
         r, c = self._followed(blend, u, r, c)
@@ -232,8 +232,3 @@ class Drives:
 def _clip(value: SX, limit: float | FloatArray) -> SX:
     """Return a value limited to ± limit."""
     return casadi.fmin(casadi.fmax(value, -limit), limit)
-
-
-def _symbols(**sizes: int) -> list[SX]:
-    """Return symbols of CasADi by name with their sizes."""
-    return [casadi.SX.sym(name, size) for name, size in sizes.items()]
