@@ -88,6 +88,7 @@ def build_model(
         raise ValueError(
             "truth.states must name the states of the FMU that are the joint positions, got none"
         )
+    read_exchange(mapping.file, extract_fmu(mapping.file))
     values = {}
     for name, value in {**mapping.parameters, **(parameters or {})}.items():
         role = "nominal" if parameters and name in parameters else "parameters"

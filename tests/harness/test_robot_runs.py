@@ -8,7 +8,7 @@ import pytest
 
 from kit.lanes import assert_rows_of_single_runs
 from kit.plants import NEEDS_MUJOCO
-from kit.robots import FOUR_JOINTS
+from kit.robots import DRIVEN_TWIN, FOUR_JOINTS
 from servobench.harness.apps.films.replay import logged_run
 from servobench.harness.apps.fmu.products import arm_product, loop_products
 from servobench.harness.batch.manifest import describe_robot
@@ -143,10 +143,30 @@ def test_worlds_without_gears_and_tool_are_refused_in_one_line():
         ConfigurationError, match="mujoco has no mechanics.backlash, .*those of kinematic and fmu"
     ):
         resolve(RunRequest("mujoco", "regression_mfac", "circle", mismatch, 3), Settings())
-    with pytest.raises(
-        ConfigurationError, match="an arm is exported without backlash: leave it out, and set"
-    ):
-        arm_product(RunRequest("kinematic", "regression_mfac", "circle", mismatch, 3), "words")
+
+
+@pytest.mark.parametrize(
+    ("mismatch", "robot", "lag", "backlash"),
+    [
+        ("none", "ur5", 0.05, 0.0),
+        ("lab", "ur5", 0.03, 0.0),
+        ("moderate+backlash=2deg", "ur5", 0.05, np.radians(2.0)),
+        ("none", "twin.toml", None, 0.005),
+    ],
+)
+def test_an_exported_arm_has_the_drive_of_its_run(
+    tmp_path, monkeypatch, mismatch, robot, lag, backlash
+):
+    monkeypatch.chdir(tmp_path)
+    play = "[plant.mechanics]\nbacklash = 0.005\n"
+    (tmp_path / "twin.toml").write_text(DRIVEN_TWIN + play, encoding="utf-8")
+    request = RunRequest("kinematic", "constant", "target", mismatch, 3, robot=robot)
+    plant = resolve(request, Settings()).plant
+    assert lag in (None, plant.lag)
+    assert abs(plant.lag - 0.2) > 0.001  # of seed 3, not the mean
+    start = arm_product(request, "words").description.start
+    np.testing.assert_array_equal(start["lag"], np.full(6, plant.lag))
+    np.testing.assert_allclose(start["backlash"], np.full(6, backlash), rtol=1e-12)
 
 
 def test_the_arm_of_a_loop_has_the_settings_of_its_plant_or_refuses_them():

@@ -13,6 +13,21 @@ joint_speed = [2.0, 2.0, 2.0, 2.0]
 """
 
 
+DRIVEN_TWIN = """
+robot = "ur10e"
+parameters = ["latency", "zero_elbow", "lag"]
+factor = [[0.004, 0.02, 0.01], [0.0, -0.01, 0.02]]
+[camera]
+latency = 0.083
+pose = { frame = "base", position = [0.75, 0.03, 2.2], rotation = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]] }
+[mean]
+command_delay = 0.02
+lag = 0.2
+tool_x = 0.03
+zero_elbow = 0.2
+"""
+
+
 def calibration_text(row, seed):
     """Return a factory calibration of an arm of Universal Robots that is wrong by tenths of a millimetre."""
     rng = np.random.default_rng(seed)

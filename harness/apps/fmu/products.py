@@ -43,7 +43,7 @@ from servobench.plant.robot.catalogue import find_robot, short_name
 REFERENCE_PERIODS = 200  # most periods of the run inside the FMU
 TOLERANCE = 1e-9
 STRETCH = 5  # periods, compared on their own where learning magnifies rounding errors
-USUAL = KinematicConfig()  # lag and limits of an exported arm
+NO_SETTINGS = Settings()
 
 
 def controller_model(request: RunRequest, settings: Settings) -> ControllerModel:
@@ -183,25 +183,29 @@ def arm_product(
     words: str,
     fmi: int = 2,
     own: PlantSetup | None = None,
-    config: KinematicConfig = USUAL,
+    settings: Settings = NO_SETTINGS,
 ) -> Product:
     """Return the true arm of a run ready for export, with `words` on its mismatch.
 
     Its start and period are those of a setup of its `own`, or home and the usual step; lag, limits and mechanics those
-    of the kinematic plant.
+    of the run's plant.
 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
-    unknown = list(request.mismatch.plant_settings)
+    unknown = [key for key in request.mismatch.plant_settings if not key.startswith("mechanics.")]
     if request.mismatch.size("camera_move") > 0.0:
         unknown.append("camera_move")
     for setting in unknown:
-        part, _, name = setting.rpartition(".")
-        remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
-        raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
+        raise ConfigurationError(
+            f"an arm is exported without {setting.removeprefix('sensing.')}: leave it out"
+        )
     true, *_ = draw_robot(request)
     setup = replace(own or nominal_setup(find_robot(request.robot)), model=true)
+    drive = resolve(request, settings).plant
+    config = KinematicConfig(
+        drive.max_joint_speed, drive.joint_range, drive.lag, mechanics=drive.mechanics
+    )
     return product(ExportOptions(fmi, setup, config, mismatch=words))
 
 
@@ -224,12 +228,9 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
             )
     scenario = draw(resolved).scenario
     run = resolved.run
-    config = resolved.plant
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
-    arm = KinematicConfig(
-        config.max_joint_speed, config.joint_range, config.lag, mechanics=config.mechanics
-    )
     setup = PlantSetup(None, scenario.start, run.period, find_robot(request.robot))
-    plant = arm_product(request, f"{request.mismatch}, seed {request.seed}", 2, setup, arm)
+    words = f"{request.mismatch}, seed {request.seed}"
+    plant = arm_product(request, words, own=setup, settings=settings)
     controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
     return plant, controller, scenario.duration
