@@ -9,7 +9,7 @@ import math
 import re
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -233,7 +233,11 @@ def _true_model(row: Row, robot: Robot) -> tuple[HandEyeModel, HandEyeModel | No
     """
     with configuration_errors(f"run {row['run_id']}: "):
         mismatch = Mismatch.parse(row["mismatch"])
-        model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
+        seed = int(row["seed"])
+        model, sample = sample_mismatch(mismatch, robot, named_seed(seed, "mismatch"))
+        if robot.twin is not None:
+            twin = robot.twin.model(robot.nominal, DEFAULT_SENSING, seed, exact=True)
+            model = cast("HandEyeModel", twin)
     if mismatch.size("camera_turn") > 0.0:
         raise ConfigurationError(
             f"run {row['run_id']} cannot be shown: films have no camera that turns"

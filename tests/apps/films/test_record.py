@@ -17,6 +17,7 @@ from PIL import Image
 from kit.command import finish, servobench, start, wait_for
 from kit.own import CELL, PLAIN_CELL, write
 from kit.plants import NEEDS_BULLET
+from kit.robots import DRIVEN_TWIN
 from servobench.harness.apps.figures.style import method_styles
 from servobench.harness.apps.films import film
 from servobench.harness.apps.films.replay import Replay, Trail, logged_run, stretch
@@ -308,6 +309,20 @@ def test_a_plant_with_a_robot_of_its_own_is_refused(refusal_of, monkeypatch, tmp
     )
     line = refusal_of("record", "out", "--kinds", "snapshots")
     assert "cannot be shown: plant Plain brings a robot of its own\n" in line
+
+
+def test_a_run_on_a_twin_is_shown_with_its_true_robot(tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "twin.toml").write_text(DRIVEN_TWIN, encoding="utf-8")
+    request = RunRequest("kinematic", "ukf_mfac", "random", "none", 3, robot="twin.toml")
+    made = run_experiment(request, Settings({"random": {"duration": 1.0}}))
+    shown = logged_run(made.row, made.steps)
+    assert not caplog.text
+    arm = np.array([shown.model.to_base(shown.model.feature(q)) for q in shown.joint_position])
+    np.testing.assert_allclose(shown.ball, arm, atol=1e-9)
+    nominal = shown.robot.nominal
+    drawn = np.array([nominal.to_base(nominal.feature(q)) for q in shown.joint_position])
+    assert np.linalg.norm(drawn - shown.ball, axis=1).min() > 0.02
 
 
 def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
