@@ -19,7 +19,7 @@ from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.log import Period
-from servobench.harness.run.loop import LoopSettings, begin, periods
+from servobench.harness.run.loop import begin, periods
 from servobench.harness.run.references import FixedPoint
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
@@ -59,7 +59,7 @@ class Side:
         self.reason = ""
         plant, controller = held_to_contract(experiment.plant, experiment.controller)
         self._controller = controller
-        endless = LoopSettings(sys.maxsize, experiment.run.preview_rows)
+        endless = replace(experiment.loop, periods=sys.maxsize, lost_after_periods=sys.maxsize)
         seeds = (named_seed(seed, "plant"), named_seed(seed, "controller"))
         self._rollout = begin(plant, controller, experiment.desired(1), endless, seeds)
         self._periods = periods(self._rollout, controller)
@@ -123,6 +123,7 @@ class Session:
         self.period = experiment.run.period
         self.held = False
         self.errors: deque[list[float]] = deque(maxlen=experiment.run.periods(HISTORY))
+        self._move = experiment.loop.camera_move
         self._reference = experiment.scenario.reference
         self._rows = np.arange(1 + experiment.run.preview_rows)
         self.advance()
@@ -132,6 +133,8 @@ class Session:
         times = self.period * self._rows
         desired = self._reference.at(times)
         self.errors.append([times[0], *(side.advance(desired) for side in self.sides)])
+        if self._move is not None and self._rows[0] == self._move.period:
+            self.model = self.model.with_camera(self._move.X_BC)
         self._rows += 1
 
     def aim(self, place: FloatArray) -> None:

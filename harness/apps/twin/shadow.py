@@ -4,6 +4,8 @@ The loop is open. Joint positions and features are those of the log, independent
 predicts a run under these commands; only the answers to the same observations are compared.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 
@@ -14,7 +16,7 @@ from servobench.harness.apps.twin.predictions import PREDICTED, check_delay, pre
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
 from servobench.harness.run.log import StepLog
-from servobench.harness.run.loop import LoopSettings, careful, run_loop
+from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.settings import remark
@@ -45,8 +47,12 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         plant = LoggedPlant(spec, table)
         check_units(plant.log, plant.reference, experiment.drawn.true)
         log = StepLog(spec, len(table))
-        never = len(table) + 1
-        loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=never)
+        loop = replace(
+            experiment.loop,
+            periods=len(table),
+            lost_after_periods=len(table) + 1,
+            camera_move=None,  # whose images are logged
+        )
         desired = experiment.desired(loop.periods)
         logged = plant.reference
         if not np.array_equal(desired[: len(logged)], logged):

@@ -17,6 +17,8 @@ from servobench.harness.config.registry import CONTROLLER_REGISTRY, offering
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.loop import LoopSettings, Rollout
+from servobench.harness.run.resolution import resolve
+from servobench.harness.run.sampling import draw
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
 
@@ -32,12 +34,21 @@ def errors(session):
     return session.errors[-1][1:]
 
 
-def test_a_session_takes_the_steps_of_a_run_to_the_bit():
-    steps = run_experiment(request(), Settings({})).steps
-    with session_of("ukf_mfac") as session:
-        advance(session, 10.0)
-        found = [row[1] for row in session.errors]
-    assert found == (1e3 * steps["error_norm"][: len(found)]).tolist()
+@pytest.mark.parametrize(
+    ("task", "mismatch"),
+    [("random", "moderate"), ("tour", "moderate"), ("random", "moderate+camera_move=60deg")],
+)
+def test_a_session_takes_the_steps_of_a_run_to_the_bit(task, mismatch):
+    asked = request(task=task, mismatch=mismatch)
+    steps = run_experiment(asked, Settings()).steps
+    with session_of("ukf_mfac", task=task, mismatch=mismatch) as session:
+        found = [session.errors[-1][1]]
+        while len(found) < len(steps):
+            session.advance()
+            found.append(session.errors[-1][1])
+    assert found == (1e3 * steps["error_norm"]).tolist()
+    final = draw(resolve(asked, Settings())).final
+    np.testing.assert_array_equal(session.model.camera, final.camera)
 
 
 def test_a_reference_that_is_redirected_begins_now():

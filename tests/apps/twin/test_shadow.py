@@ -80,6 +80,13 @@ def test_a_run_shown_to_its_own_controller_gives_its_commands_to_the_bit(folder,
     assert not seen["feature_valid"].all()
 
 
+@pytest.mark.parametrize("task", ["tour", "again"])
+def test_a_run_whose_target_jumps_is_shown_with_the_preview_that_it_had(tmp_path, task):
+    compare(["regression_mfac"], tasks=[task], seeds=[3], out=tmp_path / "runs")
+    shown, steps = logged_in_folder(ResultsFolder(tmp_path / "runs"), None, None)
+    np.testing.assert_array_equal(commands(shadow(shown, steps)), commands(steps))
+
+
 def test_a_run_with_stamped_frames_is_shown_with_them(tmp_path):
     sensing = {"latency": 0.05, "jitter": 0.1, "stamps": True, "clock_offset": 9.0}
     settings = {"kinematic": {"sensing": sensing}, "random": {"duration": 2.0}}
