@@ -1,6 +1,6 @@
 """Runs as environments of Gymnasium, alone or side by side: the policy is the controller, all else is the harness's."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, TypeAlias, cast, final
 
@@ -14,13 +14,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant
-from servobench.harness.config.settings import Sections, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import Experiment, build, build_together
 from servobench.harness.run.feasibility import check_possible
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import RunRequest, read_seed
-from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
+from servobench.harness.run.resolution import (
+    ResolvedRun,
+    check_settings,
+    resolve_sections,
+    select,
+)
 from servobench.harness.run.sampling import Drawn
 from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -28,6 +33,7 @@ from servobench.plant.contract.checks import AnyArray, FloatArray, Floats32, as_
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_seed
+from servobench.plant.contract.settings import Section
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.plants import load_engine
@@ -132,6 +138,7 @@ class Spaces:
 
 
 SEEDS = 2**31  # that an environment draws from where it is given none
+TRIED_SEEDS = 8  # with which runs have to be alike to go side by side
 PLACEHOLDER = "constant"  # the harness builds every run with a controller; this one costs least
 MARK = (40, 40, 40)  # red, green, blue
 
@@ -142,11 +149,6 @@ def check_options(options: object) -> None:
         raise ConfigurationError(
             f"reset has no options, got {options!r}; make another environment for another choice"
         )
-
-
-def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
-    """Return the same run with another seed, and so another robot, target and noise."""
-    return replace(resolved, request=replace(resolved.request, seed=seed))
 
 
 @final
@@ -178,7 +180,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         mismatch: str = "moderate",
         robot: str = DEFAULT_ROBOT,
         sensing: str = DEFAULT_SENSING,
-        settings: Sections | None = None,
+        settings: Mapping[str, Section] | None = None,
         render_mode: str | None = None,
         **others: object,
     ) -> None:
@@ -200,7 +202,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         )
         given = Settings({} if settings is None else settings)
         check_settings(given, [plant, task])
-        self.resolved: Final = resolve(request, given)
+        self._sections = resolve_sections([request], given)
+        self.resolved: Final = select(request, self._sections)
         experiment = build(self.resolved)
         experiment.plant.close()  # `reset` builds one for each episode
         check_possible(self.resolved, experiment.drawn, experiment.plant.spec)
@@ -235,6 +238,10 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             return None
         return self._rollout.observation
 
+    def with_seed(self, seed: int) -> ResolvedRun:
+        """Return the run with another seed, and so with another robot, target and noise."""
+        return select(self.resolved.request.with_seed(seed), self._sections)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats32, Info]:
@@ -254,7 +261,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         super().reset(seed=seed)
         run_seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
         self.close()
-        self._experiment = experiment = build(with_seed(self.resolved, run_seed))
+        self._experiment = experiment = build(self.with_seed(run_seed))
         desired = experiment.desired(experiment.periods + 1)  # also after the last period
         self._action = np.zeros(self._spaces.spec.n)
         self._over = False
@@ -434,14 +441,18 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
             )
         single = ServoEnv(**choice)
         self._resolved = single.resolved
+        self._with_seed = single.with_seed
         if max_episode_steps not in (None, single.periods):
             raise ConfigurationError(
                 f"max_episode_steps must be {single.periods}, as the task has so many periods, got "
                 f"{max_episode_steps}; settings= may change its duration"
             )
-        if side_by_side_key(self._resolved) is None:
+        # A twin may draw delays that differ from run to run.
+        kinds = {side_by_side_key(self._with_seed(seed)) for seed in range(TRIED_SEEDS)}
+        if None in kinds or len(kinds) > 1:
+            request = self._resolved.request
             raise ConfigurationError(
-                f"plant {self._resolved.request.plant} carries out one run at a time: gymnasium.make_vec(..., "
+                f"plant {request.plant} carries out one run at a time with {request.robot}: gymnasium.make_vec(..., "
                 "vectorization_mode='async')"
             )
         self.num_envs = int(num_envs)
@@ -490,9 +501,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, AnyArray]):
             pairs = zip(given, self.np_random.integers(SEEDS, size=count).tolist(), strict=True)
             seeds = np.array([drawn if each is None else each for each, drawn in pairs])
         self.close_extras()
-        self._many = many = build_together(
-            [with_seed(self._resolved, each) for each in seeds.tolist()]
-        )
+        self._many = many = build_together([self._with_seed(each) for each in seeds.tolist()])
         bench = self._bench = cast(Bench, many.plant)
         self._spaces = Spaces(bench.spec, many.loop.preview, stamps=bench.stamps)
         self._ended = False

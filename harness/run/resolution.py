@@ -1,6 +1,6 @@
 """A request with all its settings as typed values: names looked up and texts read once a batch."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields, replace
 from operator import attrgetter
 from typing import Any
@@ -217,7 +217,8 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     frames = sections.frames(request.plant, robot, run.period)
     drawn: Varied = ()
     if robot.twin is not None:
-        drawn = _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
+        own = flatten(sections[request.plant]).keys() - sections.given.get(request.plant, ())
+        drawn = _drawn_times(robot.twin, own, request.seed)
     if both := [key for key, _ in plant if key in of_sensor]:
         raise ConfigurationError(
             f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too"
@@ -243,11 +244,11 @@ def share_settings(one: RunRequest, other: RunRequest) -> bool:
     return one.robot in ROBOTS and _BUT_SEED(one) == _BUT_SEED(other)
 
 
-def _drawn_times(twin: Twin, usual: Section, seed: int) -> Varied:
-    """Return the times of a twin's run that differ from those of its mean, but for times that a user has set."""
+def _drawn_times(twin: Twin, own: Collection[str], seed: int) -> Varied:
+    """Return the times of a twin's run that differ from those of its mean, among its `own` settings of the plant."""
     mean = twin.times(0)
     return tuple(
-        (key, time) for key, time in twin.times(seed).items() if usual.get(key) == mean[key] != time
+        (key, time) for key, time in twin.times(seed).items() if key in own and time != mean[key]
     )
 
 

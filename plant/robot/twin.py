@@ -181,6 +181,8 @@ class Twin:
         sensing |= keys.plant.get("sensing", {})
         given = {**times, **keys.plant, "sensing": sensing}
         known = {each.name for each in fields(config)}
+        for name in keys.plant.keys() - known:
+            remark(f"twin {self.path} goes without its {name}, which the plant does not have")
         return {name: value for name, value in given.items() if name in known}
 
     def _sensing_settings(self, period: float) -> Record:

@@ -114,6 +114,9 @@ def test_latency_is_drawn_to_a_millisecond_unless_a_user_sets_it(twin):
     assert all(latency == round(latency, 3) for latency in drawn.values())
     given = Settings({"kinematic": {"sensing": {"latency": 0.1}}})
     assert {resolve(request(twin, seed), given).plant.sensing.latency for seed in range(6)} == {0.1}
+    mean = Settings({"kinematic": {"sensing": {"latency": 0.083}}})
+    kept = {resolve(request(twin, seed), mean).plant.sensing.latency for seed in range(6)}
+    assert kept == {0.083}
     varied = request(twin, 3, varied=(("latency", 0.02),))
     assert resolve(varied, Settings()).plant.sensing.latency == 0.02
 

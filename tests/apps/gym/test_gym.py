@@ -12,6 +12,7 @@ from gymnasium.wrappers import TimeAwareObservation
 from gymnasium.wrappers.vector import DictInfoToList
 
 from kit.plants import plant_parameters
+from kit.robots import DRIVEN_TWIN
 from servobench.harness.batch.api import run
 from servobench.harness.config.registry import RENDERED, default_plant
 from servobench.harness.gym import ENVIRONMENT
@@ -43,6 +44,23 @@ def test_an_episode_under_the_commands_of_a_run_is_that_run(sensing):
         if k + 1 < len(commands):
             assert reward == pytest.approx(-steps["error_norm"][k + 1] / scale * period, rel=1e-12)
     env.close()
+
+
+def test_an_episode_on_a_twin_has_the_drive_of_its_seed(tmp_path):
+    twin = tmp_path / "twin.toml"
+    twin.write_text(DRIVEN_TWIN, encoding="utf-8")
+    asked = {"task": "random", "mismatch": "none", "robot": str(twin)}
+    steps = run("ukf_mfac", seed=3, **asked).steps
+    commands = steps.filter(regex="^joint_velocity_command_").to_numpy()
+    features = steps.filter(regex="^feature_.*_m$").to_numpy()
+    env = ServoEnv(**asked)
+    env.reset(seed=3)
+    for k, command in enumerate(commands[:60]):
+        np.testing.assert_allclose(env.observation.feature, features[k], atol=1e-6)
+        env.step(command)  # [rad/s] of limits of 1 rad/s
+    env.close()
+    with pytest.raises(ConfigurationError, match=r"one run at a time with .*twin\.toml"):
+        ServoVectorEnv(2, **asked)
 
 
 def test_an_environment_can_be_sent_to_another_process_before_and_during_an_episode():
