@@ -1,5 +1,6 @@
 """Describes a results folder in words: its runs, how they were made, controllers with their aids, settings."""
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,12 +11,13 @@ from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import FROM_TWIN, knows_truth, shown_value
 from servobench.harness.batch.results import Manifest, ResultsFolder
 from servobench.harness.config.registry import CONTROLLERS, FILES
-from servobench.harness.config.settings import Sections, tuned_settings
+from servobench.harness.config.settings import tuned_settings
 from servobench.harness.config.source import find_place
 from servobench.harness.run.own_metrics import declare_metrics
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.variations import varied_columns
 from servobench.plant.contract.settings import listed
+from servobench.plant.robot.mismatch import PROFILE_SETTINGS, Mismatch
 
 # Columns, with settings that are varied
 DESCRIBED = ("plant", "sensing", "controller", "task", "mismatch")
@@ -137,13 +139,32 @@ def mark_tuned(runs: pd.DataFrame, manifest: Manifest) -> pd.DataFrame:
     return runs.replace({"controller": marked(names, manifest)})
 
 
-def describe_settings(configuration: Sections) -> dict[str, str]:
-    """Return every setting of the runs, given by section and name, as `section.name` and its text."""
+def describe_settings(manifest: Manifest) -> dict[str, str]:
+    """Return every setting of a folder as `section.name` and its text, also where a mismatch has another."""
+    others = _set_by_mismatches(manifest)
+    plants = manifest.get("plants", ())
+    changed = manifest.get("changed") or ()
     settings = {}
-    for section, values in configuration.items():
+    for section, values in manifest.get("configuration", {}).items():
         for name, value in values.items():
-            settings[f"{section}.{name}"] = _setting(value)
+            key = f"{section}.{name}"
+            texts = [_setting(value)]
+            if section in plants and key not in changed:
+                texts += others.get(name, [])
+            settings[key] = "; ".join(texts)
     return settings
+
+
+def _set_by_mismatches(manifest: Manifest) -> dict[str, list[str]]:
+    """Return what mismatches of a folder set a plant's settings to, by name of the setting."""
+    found: dict[str, list[str]] = {}
+    for word in manifest.get("mismatches", ()):
+        with contextlib.suppress(ValueError):  # files of calibrations may be elsewhere
+            mismatch = Mismatch.parse(word)
+            own = PROFILE_SETTINGS.get(mismatch.profile, {}) | mismatch.plant_settings
+            for name, value in own.items():
+                found.setdefault(name, []).append(f"{_setting(value)} with {word}")
+    return found
 
 
 def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON

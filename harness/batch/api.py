@@ -3,7 +3,7 @@
 import operator
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from itertools import islice
 from multiprocessing import current_process
@@ -33,7 +33,7 @@ from servobench.harness.config.registry import (
     offered,
     offering,
 )
-from servobench.harness.config.settings import Sections, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_seed
 from servobench.harness.run.resolution import check_settings
@@ -42,7 +42,7 @@ from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import native, remark
+from servobench.plant.contract.settings import Section, native, remark
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT
 from servobench.plant.robot.mismatch import Mismatch
 
@@ -70,7 +70,7 @@ def run(
     robot: str = DEFAULT_ROBOT,
     sensing: str = DEFAULT_SENSING,
     seed: int = 0,
-    settings: Sections | None = None,
+    settings: Mapping[str, Section] | None = None,
 ) -> RunResult:
     """Carry out one run in this process.
 
@@ -120,7 +120,7 @@ def compare(
     seeds: int | Iterable[int] = 1,
     robot: str = DEFAULT_ROBOT,
     sensings: Sequence[str] = (DEFAULT_SENSING,),
-    settings: Sections | None = None,
+    settings: Mapping[str, Section] | None = None,
     out: Path | str | None = None,
     workers: int = 1,
     executor: Executor | None = None,

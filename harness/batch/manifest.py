@@ -20,7 +20,7 @@ from servobench.harness.config.registry import (
     find_plant,
 )
 from servobench.harness.config.sensing import find_sensing, sensing_file, sensing_place
-from servobench.harness.config.settings import Sections, flatten
+from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import digest_of_module, find_place, neighbours
 from servobench.harness.run.own_metrics import OwnMetric
 from servobench.harness.run.tasks import TASK_REGISTRY
@@ -174,7 +174,9 @@ def describe_robot(name: str) -> Record:
     }
 
 
-def named_files(runs: Survey, configuration: Sections, own: Iterable[Offer]) -> dict[str, str]:
+def named_files(
+    runs: Survey, configuration: Mapping[str, Section], own: Iterable[Offer]
+) -> dict[str, str]:
     """Return the SHA-256 of each file by its name, as the user wrote it.
 
     Args:
@@ -195,7 +197,9 @@ def named_files(runs: Survey, configuration: Sections, own: Iterable[Offer]) -> 
     return {name: digest(path) for name, path in found.items() if path.is_file()}
 
 
-def _names(runs: Survey, configuration: Sections, own: Iterable[Offer]) -> Iterator[str]:
+def _names(
+    runs: Survey, configuration: Mapping[str, Section], own: Iterable[Offer]
+) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
     yield from (read_word(name).robot for name in runs.robots)
     for name in runs.robots:

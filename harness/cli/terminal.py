@@ -183,6 +183,9 @@ def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
         whole[name] = max([least[name], *map(len, lines)])
     names = [str(name) for name in rows.columns]
     keys = list(takewhile(KEYS.__contains__, names)) or names[:1]
+    # In a sweep rows are told apart by further columns, of settings that are varied.
+    further = (names[:end] for end in range(len(keys), len(names)))
+    keys = next((each for each in further if not rows[each].duplicated().any()), keys)
     part = list(keys)
     for name in names[len(keys) :]:
         if len(part) > len(keys) and sum(least[each] + GAP for each in (*part, name)) > room:

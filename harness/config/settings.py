@@ -19,7 +19,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.source import show
@@ -27,7 +27,6 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.files import Record, is_file, parse_toml, read_toml
 from servobench.plant.contract.settings import Section, override, remark
 
-Sections: TypeAlias = Mapping[str, Section]  # settings by the names of their sections
 Config = TypeVar("Config")
 TUNING = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 TUNING_WORDS = f"{TUNING.start}:{TUNING.stop}"
@@ -56,7 +55,7 @@ class Settings:
         ConfigurationError: something else than sections with keys.
     """
 
-    sections: Sections = field(default_factory=dict)
+    sections: Mapping[str, Section] = field(default_factory=dict)
     assigned: tuple[Assignment, ...] = ()
     filed: frozenset[tuple[str, str]] = frozenset()
 

@@ -192,12 +192,29 @@ def test_every_table_of_every_kind_of_folder_is_text_without_pythons_words(tmp_p
 def test_settings_are_told_in_words(tmp_path):
     folder = comparison(tmp_path / "out")
     opened = ResultsFolder(folder)
-    assert describe_settings(opened.configuration) == {}
+    assert describe_settings(opened.manifest) == {}
     limits = {"limit": "inf", "gain": 0.5, "view": False, "bounds": [1, None]}
     store.write_manifest(folder, opened.manifest | {"configuration": {"law": limits}})
-    assert describe_settings(ResultsFolder(folder).configuration) == {
+    assert describe_settings(ResultsFolder(folder).manifest) == {
         "law.limit": "no limit", "law.gain": "0.5", "law.view": "no", "law.bounds": "1, not set",
     }  # fmt: skip
+
+
+def test_settings_of_a_mismatch_stand_beside_those_of_the_plant():
+    plant = {"lag": 0.05, "command_delay": 0.02, "max_joint_speed": 1.0, "sensing.jitter": 0.0}
+    manifest = {
+        "configuration": {"kinematic": plant, "exp2": {"lag": 3.0}},
+        "plants": ["kinematic"],
+        "changed": ["kinematic.command_delay"],
+        "mismatches": ["moderate", "lab", "severe+jitter=70ms"],
+    }
+    assert describe_settings(manifest) == {
+        "kinematic.lag": "0.05; 0.03 with lab",
+        "kinematic.command_delay": "0.02",
+        "kinematic.max_joint_speed": "1.0",
+        "kinematic.sensing.jitter": "0.0; 0.07 with severe+jitter=70ms",
+        "exp2.lag": "3.0",
+    }
 
 
 def test_each_metric_is_shown_in_its_unit_with_its_digits():

@@ -294,14 +294,15 @@ def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypa
     assert text.count("rbfnn_mfac:published") == {60: 4, 80: 3}.get(room, 2)
 
 
-def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, capsys):
+@pytest.mark.parametrize("third", ["latency [ms]", "plant.lag"])
+def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, capsys, third):
     names = [f"a_controller_{i}" for i in range(6)]
     conditions = [
         ("moderate+camera_rotation=60deg", noise, latency)
         for noise in "014"
         for latency in ("0", "100")
     ]
-    rows = [dict(zip(("mismatch", "noise factor", "latency [ms]"), key, strict=True)) | dict.fromkeys(names, "100.0")
+    rows = [dict(zip(("mismatch", "noise factor", third), key, strict=True)) | dict.fromkeys(names, "100.0")
             for key in conditions]  # fmt: skip
     monkeypatch.setattr(terminal, "console", Console(width=80))
     terminal.print_tables([("a title", pd.DataFrame(rows))])

@@ -118,7 +118,7 @@ def test_the_planned_cameras_see_the_target_in_the_middle_at_home(word, robot):
         np.testing.assert_allclose(model.distance, HAND_DISTANCE * arm.workspace.scale)
 
 
-def test_out_of_view_the_jacobian_is_that_of_the_last_posture_in_view_on_the_way_from_home():
+def test_out_of_view_the_jacobian_is_that_of_the_last_posture_in_view_on_the_way():
     arm = find_robot("ur5")
     model = Sensing.parse("pixel").nominal(arm)
     home = arm.workspace.home

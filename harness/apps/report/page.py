@@ -191,7 +191,7 @@ def _page(folder: ResultsFolder, runs: pd.DataFrame) -> str:
         numbered=numbered,
         others=list(folder.other_tables()),
         facts=facts,
-        settings=describe_settings(folder.configuration),
+        settings=describe_settings(folder.manifest),
         data=_data(folder, shown, views),
     )
 
