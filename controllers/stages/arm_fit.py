@@ -128,7 +128,7 @@ class Geared(NamedTuple):
     """Joints behind their gears, (..., n) each."""
 
     joints: FloatArray  # [rad]
-    slope: FloatArray  # their derivatives by the reported ones, outside of the play
+    phase: FloatArray  # k q
     wave: FloatArray  # their derivatives by a, sin(k q)
     place: FloatArray  # their derivatives by b, x
 
@@ -378,7 +378,7 @@ class Fit:
 
         Under sensing for which that has no solution cameras stay where they are.
         """
-        q, _ = self.exposed(members, frames.path)
+        q = self.exposed(members, frames.path)
         weight = np.minimum.reduce(frames.weight, axis=-1)[..., None, :]
         features = self.scale * frames.feature[..., None, :, :]
         theta = members.theta[..., self._model]
@@ -439,24 +439,25 @@ class Fit:
         members, _ = self.iterated(members, frames, lateness, variance)
         return members
 
-    def exposed(self, members: Members, path: FloatArray) -> tuple[Geared, FloatArray]:
-        """Return joints behind gears at the exposures of frames with paths (..., J, F, 2n), and their velocities."""
-        row, rate = at_latency(path, members.latency, self.grid)
-        q = self.geared(members, row)
-        velocity, place_rate = _halves(rate)
-        play = members.theta[..., self._play, None, None]
-        return q, q.slope * velocity + play * place_rate
+    def exposed(self, members: Members, path: FloatArray) -> Geared:
+        """Return joints behind gears at the exposures of frames with paths (..., J, F, 2n)."""
+        row, _ = at_latency(path, members.latency, self.grid)
+        return self.geared(members, row)
 
     def geared(self, members: Members, row: FloatArray) -> Geared:
         """Return joints behind gears for reported ones and x, (..., E, F, 2n)."""
         q, x = _halves(row)
         play = members.theta[..., self._play, None, None]
         ripple = members.theta[..., self._ripple, None, None]
-        order = members.order[..., None, None]
-        phase = order * q
+        phase = members.order[..., None, None] * q
         wave = np.sin(phase)
-        slope = 1.0 + ripple * order * np.cos(phase)
-        return Geared(q + ripple * wave + play * x, slope, wave, x)
+        return Geared(q + ripple * wave + play * x, phase, wave, x)
+
+    def slope(self, members: Members, q: Geared) -> FloatArray:
+        """Return the derivatives of joints behind gears by the reported ones, outside of the play, (..., E, F, n)."""
+        ripple = members.theta[..., self._ripple, None, None]
+        order = members.order[..., None, None]
+        return 1.0 + ripple * order * np.cos(q.phase)
 
     def next_row(
         self, members: Members, share: FloatArray, row: FloatArray, q: FloatArray
@@ -483,7 +484,11 @@ class Fit:
 
     def fitted(self, members: Members, frames: Frames) -> Fitted:
         """Return the residuals of members at the frames, with derivatives."""
-        q, v = self.exposed(members, frames.path)
+        row, rate = at_latency(frames.path, members.latency, self.grid)
+        q = self.geared(members, row)
+        velocity, place_rate = _halves(rate)
+        play = members.theta[..., self._play, None, None]
+        v = self.slope(members, q) * velocity + play * place_rate
         since = frames.time[..., None, :]
         turn = members.turning[..., None] * since
         found = self.derivatives(members, q, turn)
@@ -504,7 +509,7 @@ class Fit:
 
     def residual(self, members: Members, frames: Frames) -> FloatArray:
         """Return y − h of members at the frames, (..., E, m, F)."""
-        q, _ = self.exposed(members, frames.path)
+        q = self.exposed(members, frames.path)
         return self._residual_at(members, frames, q)
 
     def _residual_at(self, members: Members, frames: Frames, q: Geared) -> FloatArray:

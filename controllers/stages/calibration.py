@@ -469,7 +469,7 @@ class Calibration:
         known = past[0]
         fit = self.fit
         members = known.members
-        q, _ = fit.exposed(members, path[..., None, :])
+        q = fit.exposed(members, path[..., None, :])
         turn = (members.turning * instant[..., None])[..., None]
         found = fit.feature(members, q, turn)
         seen = found[..., 0, :] / fit.scale
@@ -585,7 +585,7 @@ class Calibration:
         feature = found.feature[..., 0, :] / fit.scale
         by_turn = found.by_parameter[..., 0, :, fit.first_turn] / fit.scale
         drift = by_turn * (members.turning * self._period)[..., None]
-        by_joint = found.by_joint * q.slope[..., None, :]
+        by_joint = found.by_joint * fit.slope(members, q)[..., None, :]
         jacobian = by_joint[..., 0, :, :] / fit.scale
         return Ahead(
             feature=np.vecmat(state.share, feature + state.bias),

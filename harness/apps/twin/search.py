@@ -75,7 +75,7 @@ def _placed(fit: Fit, model: RobotModel, members: Members, frames: Frames) -> Me
     """Return members whose cameras see the pixels of the frames from where they fit best; the fit places others."""
     if not sees_pixels(model):
         return members
-    gears, _ = fit.exposed(members, frames.path)
+    gears = fit.exposed(members, frames.path)
     pixels = fit.scale * frames.feature
     cameras = members.cameras.copy()
     for member, (theta, joints) in enumerate(zip(members.theta, gears.joints, strict=True)):
