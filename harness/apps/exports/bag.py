@@ -29,6 +29,7 @@ from servobench.plant.contract.signals import COMMAND
 from servobench.plant.rendered import urdf
 from servobench.plant.robot.camera import PinholeCamera
 
+MOST = 3  # features that a message of a point holds
 UNTURNED = np.eye(3)  # a rotation
 CAMERA = "camera"  # frame: z along the optical axis, x right and y down in the image
 SIGNALS = ("reference", "true_feature", "feature")
@@ -117,7 +118,7 @@ def _vector(values: Iterable[float]) -> Message:
 
 
 def _signals(row: Mapping[Hashable, float], captured: float) -> dict[str, Message]:
-    """Return the messages of a row: those of groups of columns, and a number for each other column."""
+    """Return the messages of a row: those of groups of columns, and a number for each column that is in none."""
     time = row["time_s"]
     groups: dict[str, dict[str, float]] = {kind: {} for kind in GROUPS}
     messages: dict[str, Message] = {}
@@ -131,7 +132,10 @@ def _signals(row: Mapping[Hashable, float], captured: float) -> dict[str, Messag
     speeds, joints, *places = groups.values()
     stamps = {"reference": time, "true_feature": time, "feature": captured}
     for (kind, stamp), place in zip(stamps.items(), places, strict=True):
-        if kind != "feature" or row["feature_valid"]:
+        if len(place) > MOST:
+            for name, value in place.items():
+                messages[f"steps/{kind}_{name}"] = {"data": value}
+        elif kind != "feature" or row["feature_valid"]:
             point = _vector(place.values())
             messages[kind] = {"header": _header(stamp, CAMERA), "point": point}
     header = _header(time, urdf.BASE_LINK)

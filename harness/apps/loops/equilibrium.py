@@ -302,7 +302,9 @@ def warm_up(resolved: ResolvedRun) -> Warm:
     truth = plant.truth()
     model = experiment.drawn.true
     if truth.jacobian is None or not isinstance(model, HandEyeModel):
-        raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
+        raise ConfigurationError(
+            f"robot {resolved.request.robot}: a linear model is of {PLANT} before the bench's camera"
+        )
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
     rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)
     nominal = find_robot(resolved.request.robot).nominal

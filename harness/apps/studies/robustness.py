@@ -33,7 +33,7 @@ from servobench.harness.run.variations import Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
-from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.settings import remark, suggest
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import DEFAULT_ROBOT, find_robot
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
@@ -162,19 +162,23 @@ def predicted_limits(
     """Return from which latency on the loop of each composed controller is predicted to be unstable, in s.
 
     The prediction is that of small motions of the nominal robot without mismatch, of the plant `kinematic` with those
-    settings of `plant` that it has, too.
+    settings of `plant` that it has, too. A remark names the methods that cannot be predicted.
     """
     known = {field.name for field in fields(KinematicConfig)}
     own = {key: value for key, value in settings.sections.get(plant, {}).items() if key in known}
     latencies = [place.number / 1000.0 for place in KNOWN_LINES[LATENCY].places]
     run = settings.resolve("run", RunSettings())
     config = Settings({plant: own}).resolve(plant, KinematicConfig())
+    model_known = find_robot(robot).known
     limits = {}
     for name in controllers:
         entry = find_controller(name)
         if entry.side_by_side:
-            method = settings.resolve(name, default_config(entry))
-            limits[name] = latency_border(method, name, latencies, run, config, robot)
+            method = settings.resolve(name, default_config(entry, model_known=model_known))
+            try:
+                limits[name] = latency_border(method, name, latencies, run, config, robot)
+            except ConfigurationError as error:
+                remark(f"no latency limit is predicted for {name}: {error}")
     return limits
 
 

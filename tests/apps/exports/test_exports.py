@@ -193,6 +193,28 @@ def test_a_run_without_a_film_has_its_signals_alone(tmp_path, output_of):
     assert pixel.point.z == 0.0
 
 
+def test_features_that_a_point_has_no_room_for_are_numbers_of_a_bag(tmp_path):
+    compare(
+        ["constant"],
+        sensings=["stereo"],
+        tasks=["random"],
+        seeds=[1],
+        out=tmp_path / "run",
+        settings=SHORT,
+    )
+    export_folder(ResultsFolder(tmp_path / "run"), tmp_path / "mcap", "mcap")
+    (file,) = (tmp_path / "mcap").glob("*.mcap")
+    found = messages_of(file)
+    steps = load(tmp_path / "run").steps
+    assert "/feature" not in found
+    for kind in ("reference", "feature"):
+        columns = steps.filter(regex=f"^{kind}_[uv][12]")
+        assert len(columns.columns) == 4
+        for name, values in columns.items():
+            numbers = [each.data for _, each in found[f"/steps/{name}"]]
+            np.testing.assert_array_equal(numbers, values)
+
+
 @pytest.mark.slow
 def test_the_twin_of_a_bag_is_that_of_its_folder(tmp_path, output_of):
     excite = Path(__file__).parents[3] / "docs" / "examples" / "excite.py"

@@ -169,6 +169,28 @@ def test_limits_are_predicted_for_kinematic_joints_not_for_twins_and_rendered_ar
     assert pd.read_csv("map/predicted_limits.csv")["controller"].to_list() == predicted
 
 
+@pytest.mark.parametrize(
+    ("robot", "settings", "reason"),
+    [
+        ("ur5 with cam.toml", {}, "before the bench's camera"),
+        ("ur5", {"kinematic": {"overshoot": 0.1}}, "overshoot must be 0"),
+    ],
+)
+def test_a_limit_that_cannot_be_predicted_is_a_remark(
+    monkeypatch, tmp_path, caplog, robot, settings, reason
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cam.toml").write_text("matrix = [[615, 0, 320], [0, 615, 240], [0, 0, 1]]\n"
+                                       "width = 640\nheight = 480\n")  # fmt: skip
+    assert predicted_limits(["pid+true"], Settings(settings), robot) == {}
+    assert "no latency limit is predicted for pid+true" in caplog.text
+    assert reason in caplog.text
+
+
+def test_limits_of_an_arm_without_a_model_are_those_of_methods_that_need_none():
+    assert predicted_limits(["broyden"], Settings({}), "random_arm:7")["broyden"] > 0.0
+
+
 def test_runs_of_a_map_that_failed_are_told(monkeypatch, tmp_path, capsys):
     line = Line(LATENCY, "camera latency [ms]", (Magnitude(0.0, "ms"),))
     monkeypatch.setattr(robustness, "KNOWN_LINES", {LATENCY: line})
