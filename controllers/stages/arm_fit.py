@@ -29,7 +29,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, IntArray, Shape
 from servobench.plant.contract.features import Derivatives, FeatureModel
-from servobench.plant.contract.lanes import branch, pick, plus_diagonal, solve, where
+from servobench.plant.contract.lanes import branch, pick, solve, where
 from servobench.plant.contract.signals import BoolArray
 
 FRAMES = 160  # rows of the buffer
@@ -594,10 +594,9 @@ class Fit:
         r = (residual * weight[..., None, :]).reshape(*wide[:-2], -1)
         H = D @ D.mT
         g = np.matvec(D, r) + pull
-        diagonal = np.diagonal(H, axis1=-2, axis2=-1) + information
-        damped = information + members.damping[..., None] * diagonal
-        A = plus_diagonal(H, damped)
-        step = solve(A, g)
+        diagonal = np.einsum("...ii->...i", H)  # a view that can be written
+        diagonal += information + members.damping[..., None] * (diagonal + information)
+        step = solve(H, g)
         step = step * self._shrink(step)[..., None]
         tried = self.moved(members, step)
         found = self.residual(tried, frames)
