@@ -3,6 +3,7 @@
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePath
 from typing import NamedTuple
 
 import pandas as pd
@@ -16,8 +17,9 @@ from servobench.harness.analysis.tables import DIFFERENCE, Statistics, as_text
 from servobench.harness.batch.results import Manifest
 from servobench.harness.config.installation import short_commit
 from servobench.harness.run.outcome import FOLLOWED, SETTLED
-from servobench.harness.run.variations import varied_columns
+from servobench.harness.run.variations import varied_columns, varied_in_row
 from servobench.plant.contract.settings import Section
+from servobench.plant.robot.catalogue import read_word
 
 SIGNS = str.maketrans(
     {
@@ -191,7 +193,13 @@ def _used_libraries(manifest: Manifest) -> list[str]:
 
 def _combinations(manifest: Manifest, facts: Mapping[str, str]) -> str:
     """Return a sentence on controllers, tasks, plant, sensing and mismatch."""
-    titles = [str(each.get("title")) for each in manifest.get("robots", [])]
+    titles = []
+    for robot in manifest.get("robots", []):
+        title = str(robot.get("title"))
+        camera = read_word(str(robot.get("name"))).camera
+        if camera:
+            title += f" with {PurePath(camera).name}"
+        titles.append(title)
     robots = ", ".join(titles) or "unknown robot"
     return (
         f"Controllers: {facts['controller']}; tasks: {facts['task']}; plant: {facts['plant']} ({robots}); "
@@ -216,14 +224,15 @@ def _robots(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
 
 
 def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> str:
-    """Return a sentence with the values of each setting that the runs vary; empty if they vary none."""
-    varied = []
+    """Return a sentence with the values of each setting that runs have of their own; empty if they have none."""
+    own = []
     for name, (heading, _) in varied_columns(runs.columns).items():
-        if runs[name].nunique(dropna=False) > 1:
-            varied.append(f"{heading} {facts[heading]}")
-    if not varied:
+        values = runs[name].unique()
+        if len(values) > 1 or varied_in_row({name: values[0]}):
+            own.append(f"{heading} {facts[heading]}")
+    if not own:
         return ""
-    return f"Varied: {'; '.join(varied)}"
+    return f"Settings of the runs: {'; '.join(own)}"
 
 
 def _settings(changed: Section | None) -> str:

@@ -139,9 +139,20 @@ def methods(manifest, runs):
 
 def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     folder = sweep(tmp_path / "sweep")
-    assert ". Varied: latency [ms] 0, 50. " in methods(
+    assert ". Settings of the runs: latency [ms] 0, 50. " in methods(
         ResultsFolder(folder).manifest, load_runs(folder)
     )
+
+
+def test_the_paragraph_on_methods_names_what_all_runs_have_in_common_and_the_camera_of_a_file():
+    own = {"latency_s": 0.15, "noise_factor": 4.0, "plant.lag": 0.12, "period_s": math.nan}
+    runs = pd.DataFrame([made_up_row("a", seed=seed, **own) for seed in (3, 4)])
+    robot = {"name": "ur10e with lab/cam.toml", "title": "UR10e"}
+    text = methods({"robots": [robot], "changed": {}}, runs)
+    assert ". Settings of the runs: noise factor 4; latency [ms] 150; plant.lag 0.12. " in text
+    assert "(UR10e with cam.toml)" in text
+    usual = methods({"changed": {}}, pd.DataFrame([made_up_row("a", noise_factor=1.0)]))
+    assert "Settings of the runs" not in usual
 
 
 def test_the_paragraph_on_methods_names_python_alone_where_no_packages_are_listed():
