@@ -144,7 +144,7 @@ def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     )
 
 
-def test_the_paragraph_on_methods_names_what_all_runs_have_in_common_and_the_camera_of_a_file():
+def test_latex_tells_what_all_runs_share_and_a_camera_of_a_file():
     own = {"latency_s": 0.15, "noise_factor": 4.0, "plant.lag": 0.12, "period_s": math.nan}
     runs = pd.DataFrame([made_up_row("a", seed=seed, **own) for seed in (3, 4)])
     robot = {"name": "ur10e with lab/cam.toml", "title": "UR10e"}
