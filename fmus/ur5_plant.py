@@ -82,10 +82,6 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
     if view is not None:
         features = (FEATURE,)
         seen = (SEEN,)
-    # Only a single camera can be moved.
-    camera = None
-    if view is None or view.setup.cameras == 1:
-        camera = ("camera_position", "camera_rpy")
     return FmuMapping(
         file=path,
         inputs=("joint_velocity_command",),
@@ -94,7 +90,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         seen=seen,
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
-        camera=camera,
+        camera=("camera_position", "camera_rpy"),
         parameters=parameters,
         limits=limits,
         names=LogNames(model.arm.joint_names, model.channel.names, model.channel.unit),

@@ -217,6 +217,11 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     truth = mapping.truth
     home = () if mapping.home is None else (mapping.home,)
     camera = mapping.camera or ()
+    # Parameters of several cameras begin with the first, the one that is moved; the mapping gives where the others are.
+    pose = 3
+    if camera:
+        given = mapping.parameters.get(camera[0], 0.0)
+        pose = max((pose, *np.shape(given)[-1:]))
     captured: Names = ()
     if mapping.captured is not None:
         captured = (mapping.captured,)
@@ -232,8 +237,8 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("truth.jacobian", truth.jacobian, n * m, f"{unit}/rad"),
         ("truth.states", truth.states, n, "rad"),
         ("home", home, n, "rad"),
-        ("camera[1]", camera[:1], 3, "m"),
-        ("camera[2]", camera[1:], 3, "rad"),
+        ("camera[1]", camera[:1], pose, "m"),
+        ("camera[2]", camera[1:], pose, "rad"),
     )
     found = {}
     for role, names, *_ in roles:

@@ -182,7 +182,11 @@ class FmuWorld(World):
         if mapping.home is not None and self._has_start:
             parameters[mapping.home] = self._start
         self._setters = setters(self.description, parameters, self.lead)
-        self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
+        self._camera = []
+        for name in mapping.camera or ():
+            port = self._port("camera", (name,))
+            port.values[...] = parameters.get(name, 0.0)
+            self._camera.append(port)
         self._true = build_model(mapping, self.description) if truth.states else None
         nominal = mapping.nominal
         self._nominal = None if nominal is None else build_model(mapping, self.description, nominal)
@@ -341,7 +345,7 @@ class FmuWorld(World):
         angles = rpy_from_rotation(X_BC[..., :3, :3])
         poses = (position, angles)
         for port, values in zip(self._camera, poses, strict=True):
-            port.values[self._rows] = values
+            port.values[..., :3][self._rows] = values
 
         def show(lane: Lane) -> None:
             for port in self._camera:

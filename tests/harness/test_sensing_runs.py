@@ -201,6 +201,20 @@ def test_runs_side_by_side_are_those_of_single_runs():
     )
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_of_two_cameras_the_first_one_moves_on_the_exported_arm_as_on_that_of_numpy(version):
+    """Within the run it is displaced, and in every period it turns on; runs are side by side."""
+    turning = {"sensing": {"camera_turn": 0.05}}
+    settings = Settings({"kinematic": turning, "fmu": {**turning, "fmi_version": version}})
+    moved = replace(request("stereo"), mismatch="moderate+camera_move=20deg")
+    tables = []
+    for plant in ("kinematic", "fmu"):
+        runs = [replace(moved, plant=plant, seed=seed) for seed in (0, 1)]
+        tables.append(assert_rows_of_single_runs([resolve(run, settings) for run in runs]))
+    for wanted, came in zip(*tables, strict=True):
+        assert came["steady_state_error"] == pytest.approx(wanted["steady_state_error"], rel=1e-6)
+
+
 @pytest.mark.parametrize("word", PIXEL_WORDS)
 @pytest.mark.parametrize("task", ["exp1", "exp4", "singular_start"])
 def test_moves_are_drawn_together_until_both_ends_are_in_view(word, task):

@@ -94,9 +94,11 @@ def carry_out_suite(
         check_effects(settings, [cell.request for cell in cells], steps=False)
     seeing = {SEEING: {"image": True, **settings.sections.get(SEEING, {})}}
     whole = Settings({**settings.sections, **seeing}, filed=settings.filed)
-    sections = resolve_sections(requests, whole)
-    for request in requests:
-        select(request, sections)  # all challenges are checked before the first one runs
+    for cells in runs.values():  # all challenges are checked before the first one runs
+        requests = [cell.request for cell in cells]
+        sections = resolve_sections(requests, whole)
+        for request in requests:
+            select(request, sections)
     campaigns = {
         name: Campaign(own, whole, metrics=metrics, on_tuning_seeds=on_tuning_seeds)
         for name, own in runs.items()

@@ -327,6 +327,28 @@ def test_the_command_scores_methods_in_ones_own_world_and_goes_on_where_it_stopp
     assert "exists already" in refusal_of(*words)
 
 
+def test_a_world_with_a_camera_of_ones_own_stands_beside_one_without(
+    output_of, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, "width = 640\nheight = 480\nvertical_fov = 50\n", "eye.toml")
+    short = WORLD + "settings.task.duration = 2.0\n"
+    write(tmp_path, short, "plain.toml")
+    write(tmp_path, 'camera = "eye.toml"\n' + short, "seen.toml")
+    text = output_of(
+        "suite", "--challenges", "plain.toml,seen.toml", "--controllers", "constant", "--seeds", "1",
+        "--out", "suite", "--workers", "1",
+    )  # fmt: skip
+    assert "ranking on kinematic over 2 of 2" in text
+    robots = {
+        name: results.load_runs(tmp_path / "suite" / name)["robot"] for name in ("plain", "seen")
+    }
+    assert {name: set(each) for name, each in robots.items()} == {
+        "plain": {"ur5"},
+        "seen": {"ur5 with eye.toml"},
+    }
+
+
 def test_a_challenge_is_decided_by_its_measure_and_its_lost_runs():
     rng = np.random.default_rng(0)
     base = rng.uniform(0.6, 1.2, 64)
