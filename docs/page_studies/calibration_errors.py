@@ -14,7 +14,7 @@ from PIL import Image
 
 from page_studies import cells
 from page_studies.pictures import small
-from page_studies.study import Study, Words, settings, sweep
+from page_studies.study import CALIBRATES, Study, Words, settings, sweep
 from servobench.harness.analysis.comparison import (
     column_of,
     median_with_interval,
@@ -25,7 +25,6 @@ from servobench.harness.run.result import COMPLETED
 
 LOOKS: Final = "./docs/examples/look_then_move.py:LookThenMove"
 SERVOES: Final = "regression_mfac"
-CALIBRATES: Final = "calibrating_mfac"
 # From the hash of the last commit that changed code before they were drawn: e3486
 SEEDS: Final = "930950:930990"
 # Axis of the mismatch -> its title, unit and magnitudes

@@ -15,6 +15,7 @@ from page_studies.cells import CHANGED, CIRCLES, MOVES, Cell, quoted, rows_by_me
 from page_studies.study import (
     BETTER,
     BOTH,
+    CALIBRATES,
     ENGINES,
     FIVE,
     PUBLISHED,
@@ -66,8 +67,8 @@ def method_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
 
 
 def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """Yield a row for the better method and each of the paper's, both divisions beside each other."""
-    for name in FIVE:
+    """Yield a row for the better methods and each of the paper's, both divisions beside each other."""
+    for name in (CALIBRATES, *FIVE):
         row = {"method": quoted(name)}
         for full, words in ((name, ""), (name + SUFFIX, "as published: ")):
             own = runs[runs["controller"] == full]

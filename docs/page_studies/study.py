@@ -21,6 +21,7 @@ ENGINES: Final = ("bullet", "mujoco")
 BETTER: Final = "regression_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper
 FIVE: Final = (BETTER, *FOUR)
+CALIBRATES: Final = "calibrating_mfac"
 # Without any aid, the law as printed
 PUBLISHED: Final = tuple(name for name in METHODS if name.endswith(SUFFIX))
 # With all aids that help it

@@ -10,7 +10,17 @@ from typing import Final
 import pandas as pd
 
 from page_studies import cells
-from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
+from page_studies.study import (
+    BOTH,
+    CALIBRATES,
+    FIVE,
+    RENDERED,
+    SUFFIX,
+    Study,
+    Words,
+    settings,
+    sweep,
+)
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import (
     Estimate,
@@ -42,8 +52,8 @@ LEARNED_IN = (
     "jitter",
     "all_at_once",
 )
-LEARNED_BY = ("regression_mfac", "ukf_mpc", "rbfnn_mfac", "calibrating_mfac", "revealed")
-JUDGED = (*FIVE, "calibrating_mfac", "revealed")
+LEARNED_BY = ("regression_mfac", "ukf_mpc", "rbfnn_mfac", CALIBRATES, "revealed")
+JUDGED = (*FIVE, CALIBRATES, "revealed")
 COMPARED = (*JUDGED, *(name for name in RENDERED if name.endswith(SUFFIX)))
 # Challenges without a grade, which the suite runs only if named: later moves, and frames with stamps
 UNGRADED = ("unknown_arm_tour", "jitter_stamped", "latency_swing_stamped")
@@ -51,6 +61,7 @@ FRESH = "804203:804403"  # from the hash of the last commit that changed code be
 _UKF = {"aids.model": "nominal", "estimator.walk": "1e-12", "estimator.initial_deviation": "1e-12"}
 # Settings without which a method keeps the Jacobian of the nominal model
 FROZEN: Final[Mapping[str, Mapping[str, str]]] = {
+    CALIBRATES: {"aids.model": "nominal"},
     "regression_mfac": {"aids.model": "nominal"},
     "ukf_mfac": _UKF,
     "ukf_mpc": _UKF,
@@ -86,7 +97,10 @@ def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
     for (grade, name), runs in learning.groupby(["grade", "challenge"], sort=False):
         own = runs.set_index("controller")["score"]
         without = frozen[frozen["challenge"] == name].set_index("controller")["score"]
-        scores = {cells.quoted(each): f"{own[each]:.2f}/{without[each]:.2f}" for each in FIVE}
+        scores = {
+            cells.quoted(each): f"{own[each]:.2f}/{without[each]:.2f}"
+            for each in (*FIVE, CALIBRATES)
+        }
         rows.append({"challenge": f"`{name}`", "grade": grade} | scores)
     return {"learning": pd.DataFrame(rows).sort_values("grade", kind="stable")}
 
@@ -181,7 +195,7 @@ def shares_table(scores: pd.DataFrame) -> pd.DataFrame:
     """Return the shares of variance [%] with and without the method that calibrates, a row a set of methods."""
     equipped = LEARNED_BY[:3]
     rows = []
-    for methods in (LEARNED_BY[:2], equipped, (*equipped, "calibrating_mfac")):
+    for methods in (LEARNED_BY[:2], equipped, (*equipped, CALIBRATES)):
         shares = variance_shares(scores[scores["controller"].isin(methods)])
         row = {"methods": ", ".join(map(cells.quoted, methods))}
         rows.append(row | {name: f"{100.0 * share:.1f}" for name, share in shares.items()})
