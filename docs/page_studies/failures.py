@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
 from page_studies.cells import by_method, ended_early, quoted, rows_by_method, settled
-from page_studies.study import FIVE, Study, Words, settings, sweep
+from page_studies.study import CALIBRATES, FIVE, Study, Words, settings, sweep
 from servobench.harness.analysis.comparison import settling_times, success_rate
 from servobench.harness.apps.figures.style import figure_style, method_styles, plain_logarithms
 from servobench.harness.batch.results import load_runs
@@ -37,6 +37,7 @@ CAUSES = {
     "steady_state_error": "error in the last second [m]",
 }
 FAILED = "of the failed runs settle"
+METHODS = (*FIVE, CALIBRATES)
 RUNS = "runs"  # the part of which failures are repeated
 CHANGES = {
     "with 20 s": settings(["random.duration=20"]),
@@ -90,7 +91,7 @@ def repeated(options: Words) -> Callable[[Path], Words]:
         runs = load_runs(folder / RUNS)
         seeds = sorted(set(runs.loc[settling_times(runs).isna(), "seed"]))
         return (
-            sweep("kinematic", FIVE, "random", ",".join(map(str, seeds)) + ",", *options)
+            sweep("kinematic", METHODS, "random", ",".join(map(str, seeds)) + ",", *options)
             if seeds
             else ()
         )
@@ -172,8 +173,8 @@ def exceedance(runs: pd.DataFrame) -> Figure:
 FAILURES = Study(
     "failures",
     "how often methods fail in ten million periods, and why",
-    25,
-    {RUNS: sweep("kinematic", FIVE, "random", "100000:150000")}
+    50,
+    {RUNS: sweep("kinematic", METHODS, "random", "100000:150000")}
     | {part_of(title): repeated(options) for title, options in CHANGES.items()},
     tables,
     pictures,
