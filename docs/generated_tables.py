@@ -424,12 +424,10 @@ def variables_table() -> str:
 
 def table(header: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     """Return a Markdown table."""
-    lines = [
-        header,
-        ("---",) * len(header),
-        *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows),
-    ]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    cells = [header, *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    lines = ["| " + " | ".join(line) + " |" for line in cells]
+    lines.insert(1, "|---" * len(header) + "|")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

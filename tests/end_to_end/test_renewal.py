@@ -77,7 +77,7 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
     assert len(stored.stamp["commit"]) >= 40
     page = write(toy / "docs", "<!-- table: counts -->\nold\n<!-- end -->\n", "page.md")
     shown = generated_tables.renewed(page)
-    assert "| method | runs |\n| --- | --- |\n| constant | 3 |" in shown
+    assert "| method | runs |\n|---|---|\n| constant | 3 |" in shown
     assert f"commit {stored.stamp['commit'][:12]}; [commands](tables/counts.csv)" in shown
     assert "(tables/counts.csv)" in shown
     page.write_text(shown)
