@@ -216,12 +216,12 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         raise ValueError(f"inputs and features must name at least one number each, got {n} and {m}")
     truth = mapping.truth
     home = () if mapping.home is None else (mapping.home,)
-    camera = mapping.camera or ()
     # Parameters of several cameras begin with the first, the one that is moved; the mapping gives where the others are.
-    pose = 3
-    if camera:
-        given = mapping.parameters.get(camera[0], 0.0)
-        pose = max((pose, *np.shape(given)[-1:]))
+    camera = []
+    for place, name in enumerate(mapping.camera or ()):
+        given = mapping.parameters.get(name, 0.0)
+        size = max((3, *np.shape(given)[-1:]))
+        camera.append((f"camera[{place + 1}]", (name,), size, ("m", "rad")[place]))
     captured: Names = ()
     if mapping.captured is not None:
         captured = (mapping.captured,)
@@ -237,8 +237,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("truth.jacobian", truth.jacobian, n * m, f"{unit}/rad"),
         ("truth.states", truth.states, n, "rad"),
         ("home", home, n, "rad"),
-        ("camera[1]", camera[:1], pose, "m"),
-        ("camera[2]", camera[1:], pose, "rad"),
+        *camera,
     )
     found = {}
     for role, names, *_ in roles:

@@ -142,11 +142,17 @@ def test_a_missing_mapping_is_told(tmp_path):
 
 def spec_of(folder, units=None, own_step=None, **roles):
     """Return the spec of an FMU with an input, outputs and parameters, of the given units, by a mapping of roles."""
-    units = {"v": "rad/s", "q": "rad", "y": "", "q0": "rad", "at": "m", "turned": "rad"} | (
-        units or {}
-    )
+    units = {
+        "v": "rad/s",
+        "q": "rad",
+        "y": "",
+        "q0": "rad",
+        "at": "m",
+        "turned": "rad",
+        "two": "m",
+    } | (units or {})
     causes = dict.fromkeys(units, "output") | {"v": "input", "q0": "parameter"}
-    sizes = dict.fromkeys(units, 1) | {"at": 3, "turned": 3}
+    sizes = dict.fromkeys(units, 1) | {"at": 3, "turned": 3, "two": 6}
     variables = [
         Variable(name, i, sizes[name], causes[name], unit=unit)
         for i, (name, unit) in enumerate(units.items())
@@ -210,6 +216,10 @@ def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, m
         ({"seen": ("y",)}, "a.fmu: seen names 'y' as features does"),
         ({"camera": ("at", "y")}, r"a.fmu: camera\[2\] names 'y' as features does"),
         ({"camera": ("q0", "turned")}, r"camera\[1\] must name 3 numbers"),
+        (
+            {"camera": ("two", "at"), "parameters": {"at": (0.0, 0.0, 0.0)}},
+            r"camera\[1\] must name 3 numbers for 1 inputs and 1 features, got 6",
+        ),
         ({"inputs": ("q",), "joints": ()}, "inputs names 'q', which is of causality output"),
         (
             {"joints": ("q", "y"), "features": ("at",)},
